@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use lattices::import::{
-    Conventions, Instruments, KickIs, Lattice, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, assemble,
-    bare, write,
+    Conventions, Input, Instruments, KickIs, Lacking, Lattice, Measurement, OrbitUnit, Order, PerInstrument, Signs,
+    Table, assemble, bare, write,
 };
 use measured::lattice::ring;
 use measured::unknowns::groups;
@@ -38,7 +38,7 @@ fn imported(path: &Path) -> Result<(Lattice, Instruments), MeasuredError> {
 }
 
 fn tunes(folder: &Folder) -> Tunes {
-    Optics::of(&ring(folder, &[]).unwrap(), Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap()
+    Optics::of(&ring(folder, &[], &[]).unwrap(), Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap()
 }
 
 /// The response [mm/mrad] of the lattice as written.
@@ -202,6 +202,36 @@ fn refused(path: &Path) -> String {
     imported(path).unwrap_err().to_string()
 }
 
+/// A file of pyAT may state how often it is repeated; without that one cell is no ring, though its tunes would be those of a cell.
+#[test]
+fn one_period_is_not_taken_for_the_ring() {
+    let dipole = format!(
+        r#"{{"FamName": "B", "Class": "Dipole", "Length": 1, "BendingAngle": {}, "EntranceAngle": 0.1, "ExitAngle": 0.1}}"#,
+        core::f64::consts::TAU / 12.0
+    );
+    let read = |properties: &str| {
+        let text = format!(r#"{{"atjson": 1, "elements": [{BPM}, {COR}, {dipole}], "properties": {{{properties}}}}}"#);
+        let (_folder, path) = file("ring.json", &text);
+        Input::read(&path, &Lacking::default())
+    };
+    let said = read("").unwrap_err().to_string();
+    let expected = "the dipoles bend by 30.0000 degrees, expected the 360 of a ring; it looks like one of 12 periods: state the periodicity, or write all of the ring";
+    assert!(said.ends_with(expected), "{said}");
+    let Input::Lattice(lattice) = read(r#""periodicity": 12"#).unwrap() else { panic!("a lattice") };
+    assert_eq!(lattice.elements.len(), 36);
+    let said = read(r#""periodicity": 7"#).unwrap_err().to_string();
+    assert!(said.ends_with("the dipoles bend by 210.0000 degrees, expected the 360 of a ring"), "{said}");
+    // a table of MAD-X states no periodicity
+    let text = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let (cell, _) = text.split_once(" \"BPM.8\"").unwrap();
+    let (_folder, path) = file("ring.tfs", cell);
+    let said = Input::read(&path, &Lacking::default()).unwrap_err().to_string();
+    assert!(
+        said.ends_with("expected the 360 of a ring; it looks like one of 12 periods: write all of the ring"),
+        "{said}"
+    );
+}
+
 const BPM: &str = r#"{"FamName": "BPM", "Class": "Monitor", "Length": 0.2}"#;
 const COR: &str =
     r#"{"FamName": "COR", "Class": "Quadrupole", "Length": 0.4, "PolynomB": [0, 2], "PolynomA": [0, 0.1]}"#;
@@ -217,6 +247,48 @@ fn long_monitors_and_correctors_in_magnets_act_in_the_middle() {
     assert_eq!((folder.monitors[0].at, folder.correctors[0].at), (1, 4));
     assert_eq!(groups(&folder)[0], [[3, 5]], "the halves are one magnet");
     assert_eq!(lattice.left_out["skew gradient (couples the planes)"], 1);
+}
+
+/// Correctors that are windings of dipoles with a gradient of -0.5 /m^2, by pyAT, which spreads a `KickAngle` along its magnet: a thin kick in the middle
+/// gives 3 % less in x and more in y.
+#[test]
+fn a_corrector_in_a_magnet_kicks_all_along_it() {
+    let drift = |length: f64| format!(r#"{{"FamName": "D", "Class": "Drift", "Length": {length}}}"#);
+    let quadrupole = |length: f64, k1: f64| {
+        format!(r#"{{"FamName": "Q", "Class": "Quadrupole", "Length": {length}, "PolynomB": [0, {k1}]}}"#)
+    };
+    let bend = core::f64::consts::TAU / 16.0;
+    let dipole = format!(
+        r#"{{"FamName": "cor", "Class": "Dipole", "Length": 1.2, "BendingAngle": {bend}, "PolynomB": [0, -0.5]}}"#
+    );
+    let (focusing, other) = (quadrupole(0.4, 1.6), quadrupole(0.5, 0.4));
+    let monitor = r#"{"FamName": "bpm", "Class": "Monitor", "Length": 0}"#.to_owned();
+    let gap = || drift(0.4);
+    let cell = [monitor, drift(0.5), focusing, gap(), dipole.clone(), gap(), other, gap(), dipole, drift(0.5)];
+    let text = format!(
+        r#"{{"atjson": 1, "elements": [{}], "properties": {{"energy": 1.5e9, "periodicity": 8}}}}"#,
+        cell.join(", ")
+    );
+    let (_folder, path) = file("ring.json", &text);
+    let (lattice, instruments) = imported(&path).unwrap();
+    let response = response(&bare(&lattice, &instruments).unwrap());
+    // x of the first monitor to all windings in x, y to all in y [mm/mrad]
+    let by_pyat = [
+        [
+            2.32419, 3.03558, 3.45351, 2.15833, 1.05845, -0.92154, -2.41678, -3.06096, -3.42564, -2.07661, -0.93856,
+            1.02696, 2.50634, 3.08250, 3.39346, 1.99228,
+        ],
+        [
+            1.31803, 1.57007, 0.09145, -0.89387, -1.37738, -0.98993, 0.80250, 1.53635, 0.85654, -0.00719, -1.35842,
+            -1.53169, 0.02510, 1.00129, 1.34212, 0.88183,
+        ],
+    ];
+    for (plane, expected) in by_pyat.into_iter().enumerate() {
+        let found = response.view((8 * plane, 16 * plane), (1, 16));
+        let off = found.iter().zip(expected).map(|(found, expected)| (found - expected).abs()).fold(0.0, f64::max);
+        // pyAT's ten steps a magnet
+        assert!(off < 1e-4 * found.amax(), "plane {plane}: {off}");
+    }
 }
 
 #[test]
@@ -264,6 +336,49 @@ fn kicks_displacements_and_rolls_are_said() {
     let begins = ["displacements", "kicks of correctors", "rolls of monitors", "skew gradient"];
     assert!(left_out.iter().zip(begins).all(|((what, _), begin)| what.starts_with(begin)), "{left_out:?}");
     assert_eq!(left_out.iter().map(|(_, count)| *count).collect::<Vec<_>>(), [1, 2, 1, 1]);
+}
+
+/// A dipole that is rolled and shifted is the one that stands right, in every format; its gradient turns as a quadrupole's does.
+#[test]
+fn errors_of_alignment_of_a_dipole_are_left_out_and_said() {
+    let (sin, cos) = 2.8e-5_f64.sin_cos();
+    let at_file = format!(
+        r#"{{"atjson": 1, "elements": [{BPM}, {{"FamName": "cor", "Class": "Dipole", "Length": 1, "BendingAngle": 0.1, "PolynomB": [0, 0.5],
+           "R1": [[{cos}, 0, {sin}]], "T1": [1e-4, 0, 0, 0, 0, 0]}}], "properties": {{}}}}"#
+    );
+    let xsuite = r#"{"element_names": ["bpm", "cor"], "elements": {"bpm": {"__class__": "Marker"},
+        "cor": {"__class__": "Bend", "length": 1.0, "angle": 0.1, "k1": 0.5, "rot_s_rad_no_frame": 2.8e-5, "shift_x": 1e-4}}}"#;
+    let pals = BY_TAO.replace("L: 2", "L: 1").replace(
+        "          e1: 0.05",
+        "        MagneticMultipoleP: {Kn1: 0.5}\n        BodyShiftP: {x_rot: 1e-4, z_rot: 2.8e-5}",
+    );
+    for text in [at_file.as_str(), xsuite, &pals] {
+        let (_folder, path) = file("ring", text);
+        let (lattice, _) = imported(&path).unwrap();
+        let dipole = lattice.elements.last().unwrap();
+        assert!((dipole.bend - 0.1).abs() < 1e-12 && (dipole.k1 - 0.5).abs() < 1e-8, "{dipole:?}");
+        let said: Vec<&str> = lattice.left_out.into_keys().map(|what| &what[..12]).collect();
+        assert_eq!(said, ["displacement", "rolls of dip", "skew gradien"], "{text}");
+    }
+    // a table of MAD-X has rolls alone
+    let text = fs::read_to_string(recorded("imports/twelve-cells.tfs")).unwrap();
+    let names = text.lines().find(|line| line.starts_with('*')).unwrap();
+    let tilt = names.split_whitespace().skip(1).position(|name| name == "TILT").unwrap();
+    let rolled = |line: &str| {
+        let mut cells: Vec<&str> = line.split_whitespace().collect();
+        cells[tilt] = "2.8e-5";
+        cells.join(" ")
+    };
+    let lines = text.lines().map(|line| if line.contains("\"SBEND\"") { rolled(line) } else { line.to_owned() });
+    let (_folder, path) = file("ring.tfs", &lines.collect::<Vec<_>>().join("\n"));
+    let (lattice, instruments) = imported(&path).unwrap();
+    assert_eq!(lattice.left_out.values().copied().collect::<Vec<_>>(), [12]);
+    let [own, flat] = [bare(&lattice, &instruments).unwrap(), {
+        let (lattice, instruments) = imported(&recorded("imports/twelve-cells.tfs")).unwrap();
+        bare(&lattice, &instruments).unwrap()
+    }]
+    .map(|folder| tunes(&folder));
+    assert_eq!((own.x, own.y), (flat.x, flat.y));
 }
 
 /// By Xsuite, `line.insert` leaves slices of a drift; an edge may be switched off.
@@ -389,6 +504,27 @@ fn a_file_of_no_known_format_is_refused_with_what_it_holds() {
     assert!(said("").contains("found the line \"\""));
 }
 
+/// Correctors that differ by another field of the file alone; what holds the properties of the ring is none of them.
+#[test]
+fn instruments_are_chosen_by_any_field() {
+    let kicker =
+        |common: &str| format!(r#"{{"FamName": "KICK", "Class": "Corrector", "Length": 0, "CommonName": "{common}"}}"#);
+    let ring = r#"{"FamName": "SOME_RING", "Class": "RingParam", "Length": 0, "CommonName": "PKH_0"}"#;
+    let (_folder, path) = at(&format!("{ring}, {BPM}, {}, {COR}, {}", kicker("PKH_1"), kicker("PKV_1")));
+    let lattice = Lattice::read(&path).unwrap();
+    let choose = |patterns: &[&str]| {
+        let correctors: Vec<_> = patterns.iter().map(|pattern| pattern.parse().unwrap()).collect();
+        Instruments::choose(&lattice, &[], &correctors)
+    };
+    let chosen = choose(&["x:CommonName=pkh*", "y:CommonName=PKV*"]).unwrap();
+    assert_eq!(chosen.corrector_names(&lattice), ["x:PKH_1", "y:PKV_1"]);
+    // by name and by type as before
+    assert_eq!(choose(&["KICK"]).unwrap().corrector_names(&lattice), choose(&[]).unwrap().corrector_names(&lattice));
+    assert_eq!(choose(&["*"]).unwrap().correctors.len(), lattice.elements.len() - 1);
+    let said = choose(&["SOME*"]).unwrap_err().to_string();
+    assert!(said.contains("--correctors SOME*: no element has such a name; the first are BPM, KICK, COR"), "{said}");
+}
+
 #[test]
 fn a_mat_file_is_read_by_the_name_of_its_lattice() {
     let several = recorded("imports/twelve-cells.at.mat");
@@ -436,8 +572,14 @@ fn tables_that_do_not_fit_are_refused() {
         said(",x:COR[1]\nx:BPM[13],0.5\n", None)
             .contains("x:BPM[13] is none of the lattice's, which are x:BPM[1], y:BPM[1]")
     );
-    assert!(said(",x:COR[1],x:COR[1]\nx:BPM[1],0.5,1\n", None).contains("columns: number 2 stands there twice"));
+    assert!(said(",x:COR[1],x:COR[1]\nx:BPM[1],0.5,1\n", None).contains("columns: x:COR[1] stands there twice"));
     assert!(said(",x:COR[1]\nx:BPM[1],a\n", None).contains("line 2: expected a number, found a"));
     assert!(said("", None).contains("no line of numbers"));
+    // a comment has commas, a table has spaces
+    assert!(said("  # mm, by 0.2 mrad; of May\n_ x:COR[1] y:COR[2]\nx:BPM[2] 0.5 nan\n", None).contains("0.5, NaN"));
+    assert!(
+        said("# by hand\n\nx:BPM[1] 0.5\n# more\nx:BPM[2] a\n", Some(Order::Planes))
+            .contains("line 5: expected a number")
+    );
     assert!(said("# by hand\n; x:COR[1]; y:COR[2]\nx:BPM[2]; 0.5;\n", None).contains("0.5, NaN"));
 }

@@ -5,7 +5,8 @@
 //!
 //! `x = (g_y r_x - c_x r_y)/(g_x g_y - c_x c_y)`, and with x and y exchanged,
 //!
-//! or `x = r_x/g_x` where it reads one plane only. A corrector's kick is `k sqrt(g^2 + c^2)` along an axis rolled by `atan(c/g)`. Skew gradients,
+//! or `x = r_x/g_x` where it reads one plane only. A corrector's kick is `k sqrt(g^2 + c^2)` along an axis rolled by `atan(c/g)`; a winding of a magnet is the
+//! thin kick in its middle that does the same beyond. Skew gradients,
 //! and strengths of dipoles, stand in the machine file as fitted; strengths of quadrupoles stand there as in the lattice, to be estimated.
 
 use nalgebra::DMatrix;
@@ -13,7 +14,7 @@ use serde_json::{Value, json};
 use twin::Plane;
 
 use crate::fit::Fit;
-use crate::folder::Folder;
+use crate::folder::{CorrectorRow, Folder};
 use crate::lattice;
 use crate::straight::DEAD;
 use crate::unknowns::Kind;
@@ -139,7 +140,9 @@ fn correctors(folder: &Folder, fitted: &Fit) -> Vec<Corrector> {
     });
     let used = folder.correctors.iter().enumerate().filter(|(_, one)| one.is_used);
     let one = |(column, one): (usize, &crate::folder::CorrectorRow)| {
-        let [gain, coupling] = found[column];
+        let thin = as_thin(folder, fitted, one);
+        let own = one.plane.index();
+        let [gain, coupling] = [found[column][0] * thin[own], found[column][1] * thin[1 - own]];
         let roll = (coupling / gain).atan();
         Corrector {
             plane: one.plane,
@@ -151,6 +154,25 @@ fn correctors(folder: &Folder, fitted: &Fit) -> Vec<Corrector> {
         }
     };
     used.map(one).collect()
+}
+
+/// Thin kick in the middle of a magnet over that of a winding along it, in both planes, by the orbit beyond: `sin(f)/f`, or `sinh(f)/f` where the magnet
+/// defocuses, `f = sqrt|k| L/2`; 1 of other correctors.
+fn as_thin(folder: &Folder, fitted: &Fit, corrector: &CorrectorRow) -> [f64; 2] {
+    let Some([row, _]) = lattice::winding(folder, corrector.at) else { return [1.0; 2] };
+    let half = &folder.lattice[row];
+    let group = fitted.groups[0].iter().position(|group| group.contains(&row));
+    let k1 = group.map_or(half.k1, |group| fitted.unknowns[group].kind.gradient(half.k1, fitted.values[group]));
+    [(half.bend / half.length).powi(2) + k1, -k1].map(|k| {
+        let f = k.abs().sqrt() * half.length;
+        if f == 0.0 {
+            1.0
+        } else if k > 0.0 {
+            f.sin() / f
+        } else {
+            f.sinh() / f
+        }
+    })
 }
 
 /// The lattice of the folder with what the fit has found of dipoles, skew gradients and instruments.
@@ -167,6 +189,9 @@ fn machine(folder: &Folder, fitted: &Fit, monitors: &[Monitor], correctors: &[Co
         })?;
         Some(fitted.values[strengths.len() + group])
     };
+    let gradient = |group: usize, magnet: &Value| {
+        fitted.unknowns[group].kind.gradient(magnet["k1"].as_f64().unwrap_or(0.0), fitted.values[group])
+    };
     let width = fitted.unknowns.iter().find(|one| matches!(one.kind, Kind::Strength(_))).map(|one| one.width);
     let mut families = serde_json::Map::new();
     let mut elements = Vec::new();
@@ -176,14 +201,13 @@ fn machine(folder: &Folder, fitted: &Fit, monitors: &[Monitor], correctors: &[Co
         match (one["type"].as_str().unwrap_or_default(), group) {
             ("bpm" | "corrector", _) => continue,
             ("quadrupole", None) => one["fit"] = json!(false),
+            ("quadrupole", Some(group)) if one["fit"] == false => one["k1"] = json!(gradient(group, &one)),
             ("quadrupole", Some(group)) if strengths[group].len() > 1 => {
                 let family = param(folder, &fitted.groups[0][group]);
                 one["family"] = json!(family);
                 families.insert(family, json!({"supply": "dipole", "fit": "family"}));
             }
-            ("sbend", Some(group)) => {
-                one["k1"] = json!(one["k1"].as_f64().unwrap_or(0.0) * fitted.values[group]);
-            }
+            ("sbend", Some(group)) => one["k1"] = json!(gradient(group, &one)),
             ("multipole", _) => one["k1sl"] = json!(skew_of(&name).unwrap_or(0.0)),
             _ => {}
         }
@@ -237,12 +261,12 @@ mod tests {
     use super::*;
     use crate::fit::{Settings, fit};
     use crate::model::Model;
-    use crate::testing::{NOISE, machine as truth, measured, ring};
+    use crate::testing::{NOISE, machine as truth, measured, ring_with_winding};
 
     /// The response of the machine file with the strengths that were fitted, in orbits, is the fitted matrix without its gains.
     #[test]
     fn the_machine_file_has_what_the_fit_has_found() {
-        let lattice = ring();
+        let lattice = ring_with_winding();
         let folder = measured(&lattice, &truth(&lattice, 9), NOISE, 4);
         let fitted = fit(&folder, &Settings::default(), &mut |_| ()).unwrap();
         let calibrated = Calibrated::of(&folder, &fitted);

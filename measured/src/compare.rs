@@ -55,8 +55,8 @@ pub struct Other {
     pub word: &'static str,
     /// Where; of a whole family what its members share.
     pub at: String,
-    /// True of a number that is a share, of a gain its relative change; a gradient is in 1/m.
-    pub is_share: bool,
+    /// Unit of the change, empty of a share.
+    pub unit: &'static str,
     /// The change, of a whole family its rms.
     pub change: f64,
     /// Its standard deviation.
@@ -188,7 +188,7 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
                 ("stray_gradient", "dipoles") => "dipole_gradient",
                 (kind, _) => kind,
             };
-            all.push(Other { word, at: format!("all {}", family.class), is_share: false, change, sigma });
+            all.push(Other { word, at: format!("all {}", family.class), unit: "1/m", change, sigma });
         }
     }
     Ok(all)
@@ -199,7 +199,7 @@ fn is_told_alone(changed: &Hierarchy, number: usize) -> bool {
     let (change, sigma) = change(changed, number);
     let is_alone = match changed.unknowns[number].kind {
         Kind::Strength(_) => changed.classes[number] == ALL,
-        Kind::RfScale | Kind::Wiggler(_) => true,
+        Kind::RfScale | Kind::Wiggler(_) | Kind::Added(_) => true,
         _ => false,
     };
     is_alone && change.abs() > clear(changed.unknowns.len()) * sigma
@@ -219,15 +219,21 @@ fn change(changed: &Hierarchy, number: usize) -> (f64, f64) {
 fn other(folder: &Folder, changed: &Hierarchy, number: usize) -> Other {
     let kind = changed.unknowns[number].kind;
     let (change, sigma) = change(changed, number);
-    let is_share = !matches!(kind, Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_));
+    let unit = match kind {
+        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => "1/m",
+        Kind::Added(_) => "1/m^2",
+        _ => "",
+    };
     let at = name(folder, &changed.groups, kind);
-    Other { word: word(folder, &changed.groups, kind), at, is_share, change, sigma }
+    Other { word: word(folder, &changed.groups, kind), at, unit, change, sigma }
 }
 
 /// Changes of the groups of the fit.
 fn gradients(folder: &Folder, before: &Hierarchy, changed: &Hierarchy) -> Vec<Change> {
     let strengths = &changed.groups[0];
-    let is_single = |&group: &usize| !strengths.iter().any(|other| holds(&strengths[group], other));
+    let has_factor = |group: usize| changed.unknowns.iter().any(|one| one.kind == Kind::Strength(group));
+    let is_single =
+        |&group: &usize| has_factor(group) && !strengths.iter().any(|other| holds(&strengths[group], other));
     let mut all = Vec::new();
     for group in (0..strengths.len()).filter(is_single) {
         let rows = strengths[group].clone();

@@ -1,7 +1,7 @@
 //! How far a measurement departs from values of the unknowns that are expected of it: those of an earlier measurement, or of a model that is
 //! believed.
 //!
-//! Magnets may depart by 3 %, skew gradients by 0.003 /m, instruments by 1 %; those that clearly depart further by as much as a fit allows. Of a
+//! Magnets may depart by 3 %, skew gradients by 0.003 /m (gradients that are added by 0.003 /m^2), instruments by 1 %; those that clearly depart further by as much as a fit allows. Of a
 //! departure `m ± s` with a prior `0 ± w` the `ln` Bayes factor against none is
 //!
 //! `m^2/(2 s^2) - ln(w/s)`.
@@ -98,7 +98,9 @@ impl Departures {
         let gain = match self.unknowns[at].kind {
             Kind::MonitorCoupling(row) => Some(Kind::MonitorGain(row)),
             Kind::CorrectorCoupling(column) => Some(Kind::CorrectorGain(column)),
-            Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => return (after - before, self.sigma(at)),
+            Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::Added(_) => {
+                return (after - before, self.sigma(at));
+            }
             _ => None,
         };
         match gain.and_then(|gain| self.unknowns.iter().position(|one| one.kind == gain)) {
@@ -150,7 +152,7 @@ fn followed(uncertainty: &Uncertainty, unknowns: &[Unknown], errors: &DMatrix<f6
 pub fn beforehand(kind: Kind) -> f64 {
     match kind {
         Kind::Strength(_) => DEPARTURES.strength,
-        Kind::Skew(_) | Kind::Gradient(_) => DEPARTURES.skew,
+        Kind::Skew(_) | Kind::Gradient(_) | Kind::Added(_) => DEPARTURES.skew,
         Kind::Wiggler(_) => DEPARTURES.wiggler,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::RfScale | Kind::HeldFrequency => DEPARTURES.gain,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => DEPARTURES.coupling,

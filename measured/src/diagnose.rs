@@ -340,7 +340,7 @@ pub fn word(folder: &Folder, groups: &Groups, kind: Kind) -> &'static str {
 fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
     let middle = |row: usize| folder.lattice[row].s + 0.5 * folder.lattice[row].length;
     match kind {
-        Kind::Strength(group) => middle(groups[0][group][0]),
+        Kind::Strength(group) | Kind::Added(group) => middle(groups[0][group][0]),
         Kind::Skew(group) => middle(groups[1][group][0]),
         Kind::Gradient(group) => middle(groups[2][group][0]),
         Kind::Wiggler(group) => middle(groups[3][group][0]),

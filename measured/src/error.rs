@@ -50,6 +50,9 @@ pub enum MeasuredError {
         /// Of these in use.
         kicking: usize,
     },
+    /// Nothing of the machine can be fitted.
+    #[error("{0}: nothing to fit: lattice.csv has neither a quadrupole nor a dipole with a gradient (k1_start_1_m2)")]
+    NoGradient(String),
     /// The normal equations are singular, though every unknown has a prior: a number is not finite.
     #[error("the normal equations are singular after {0} steps")]
     Singular(usize),

@@ -83,10 +83,13 @@ const LEAST_LEFT: f64 = 0.1;
 /// [`MeasuredError`].
 pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str)) -> Result<Fit, MeasuredError> {
     let groups = groups(folder);
+    if groups.iter().all(Vec::is_empty) {
+        return Err(MeasuredError::NoGradient(folder.name.clone()));
+    }
     let model = Model::of(folder, &groups, settings.rf)?;
     let of_reference = folder.meta.reference_fit.as_ref().is_none_or(|fit| fit.flags.coupling == "Yes");
     let coupling = settings.coupling.unwrap_or(of_reference);
-    let unknowns = unknowns(folder, [&groups[0], &groups[1]].map(Vec::len), coupling, &settings.widths);
+    let unknowns = unknowns(folder, &groups, coupling, &settings.widths);
     let mut data = Data::of(folder);
     if data.elements() == 0 {
         return Err(MeasuredError::Empty {
@@ -264,6 +267,88 @@ mod tests {
         // 96 strengths: their mean square scatters by 0.14
         let mean = all.iter().map(nees).sum::<f64>() / 4.0;
         assert!((0.5..1.5).contains(&mean), "NEES {mean}");
+    }
+
+    /// The same matrix for kicks of 1 rad: elements of metres, noise of millimetres.
+    #[test]
+    fn a_fit_does_not_depend_on_the_kick_that_the_matrix_is_counted_for() {
+        let ring = ring();
+        let folder = measured(&ring, &machine(&ring, 1), NOISE, 101);
+        let mut per_radian = folder.clone();
+        // a power of 2 scales everything without rounding
+        per_radian.matrix *= 4096.0;
+        per_radian.correctors.iter_mut().for_each(|one| one.kick *= 4096.0);
+        per_radian.monitors.iter_mut().for_each(|one| one.sigma *= 4096.0);
+        per_radian.dispersion.iter_mut().for_each(|one| *one *= 4096.0);
+        per_radian.meta.delta_rf *= 4096.0;
+        assert!(per_radian.matrix.amax() > 1e3);
+        let [small, large] =
+            [folder, per_radian].map(|folder| fit(&folder, &Settings::default(), &mut |_| ()).unwrap());
+        assert!((small.values - large.values).amax() < 1e-9 && (small.chi2_loco - large.chi2_loco).abs() < 1e-9);
+    }
+
+    /// The ring with its focusing in dipoles.
+    fn combined_function() -> Folder {
+        let mut ring = ring();
+        ring.meta.reference_fit = None;
+        let share = 0.05;
+        for row in ring.lattice.iter_mut() {
+            match row.name.as_str() {
+                "QF" | "QD" => row.bend = share,
+                "B" => row.bend -= 2.0 * share,
+                _ => {}
+            }
+        }
+        ring
+    }
+
+    #[test]
+    fn dipoles_with_gradients_are_unknowns() {
+        let ring = combined_function();
+        let fitted = |seed| {
+            let truth = machine(&ring, seed);
+            (fit(&measured(&ring, &truth, NOISE, 300 + seed), &Settings::default(), &mut |_| ()).unwrap(), truth.2)
+        };
+        let all: Vec<_> = (0..4).map(fitted).collect();
+        for (fit, _) in &all {
+            assert_eq!(fit.groups.each_ref().map(Vec::len), [24, 0, 0, 0]);
+            assert!((0.55..0.95).contains(&fit.chi2_loco), "{}", fit.chi2_loco);
+        }
+        // 96 strengths, as above
+        let mean = all.iter().map(nees).sum::<f64>() / 4.0;
+        assert!((0.5..1.5).contains(&mean), "NEES {mean}");
+    }
+
+    #[test]
+    fn a_ring_without_a_gradient_has_nothing_to_fit() {
+        let mut ring = combined_function();
+        ring.lattice.iter_mut().for_each(|row| row.k1 = 0.0);
+        assert_eq!(
+            fit(&ring, &Settings::default(), &mut |_| ()).unwrap_err().to_string(),
+            "ring: nothing to fit: lattice.csv has neither a quadrupole nor a dipole with a gradient (k1_start_1_m2)"
+        );
+    }
+
+    /// All dipoles as one parameter that starts at 0.
+    #[test]
+    fn a_gradient_that_starts_at_nothing_is_added() {
+        let mut ring = ring();
+        let dipoles = (0..ring.lattice.len()).filter(|&row| ring.lattice[row].bend != 0.0).collect();
+        let reference = ring.meta.reference_fit.as_mut().unwrap();
+        reference.fit_parameters.insert(0, crate::folder::Group { elements: dipoles, field: "K".into() });
+        let (model, unknowns, mut truth) = machine(&ring, 7);
+        assert_eq!((unknowns[0].kind, unknowns[1].kind), (Kind::Added(0), Kind::Strength(1)));
+        truth[0] = 0.02;
+        let folder = measured(&ring, &(model, unknowns, truth.clone()), NOISE, 8);
+        let fit = fit(&folder, &Settings::default(), &mut |_| ()).unwrap();
+        assert!(
+            (fit.values[0] - 0.02).abs() < 3.0 * fit.sigma(0) && fit.sigma(0) < 0.005,
+            "{} {}",
+            fit.values[0],
+            fit.sigma(0)
+        );
+        let nees = nees(&(fit, truth));
+        assert!((0.13..1.87).contains(&nees), "NEES {nees}");
     }
 
     #[test]

@@ -458,7 +458,8 @@ fn everything(folder: &Folder, fitted: &Groups) -> Groups {
             gradients.push(middle);
         }
     }
-    strengths.extend(in_common(folder, &fitted[0]));
+    let with_gradient = fitted[0].iter().filter(|group| group.iter().any(|&row| folder.lattice[row].k1 != 0.0));
+    strengths.extend(in_common(folder, &with_gradient.cloned().collect::<Vec<_>>()));
     let straights = straights(folder);
     gradients.extend(straights.iter().map(|rows| vec![rows[rows.len() / 2]]));
     [strengths, skews, gradients, straights]
@@ -481,7 +482,7 @@ fn in_common(folder: &Folder, groups: &[Magnets]) -> Vec<Magnets> {
 /// Unknowns of all groups and of all instruments.
 fn all_unknowns(folder: &Folder, groups: &Groups, settings: &Settings) -> Vec<Unknown> {
     let Widths { skew, wiggler, .. } = settings.widths;
-    let fitted = unknowns(folder, [groups[0].len(), groups[1].len()], true, &settings.widths);
+    let fitted = unknowns(folder, groups, true, &settings.widths);
     let (magnets, instruments) = fitted.split_at(groups[0].len() + groups[1].len());
     let gradients = (0..groups[2].len()).map(|group| Unknown { kind: Kind::Gradient(group), mean: 0.0, width: skew });
     let wigglers = (0..groups[3].len()).map(|group| Unknown { kind: Kind::Wiggler(group), mean: 0.0, width: wiggler });

@@ -1,16 +1,18 @@
 //! The ring of the twin from the rows of a lattice.
 //!
 //! Rows are written as a machine file (docs/machine.md), with one name each: `QF.5`. A corrector kicks in its middle, which is what a kick
-//! spread along a field-free length does. A magnet with a skew gradient or a further gradient to be fitted is cut in two, with a
+//! spread along a field-free length does; of a winding of a magnet, whose kick is spread along a field, the model knows more ([`winding`]). A magnet with a skew gradient or a further gradient to be fitted is cut in two, with a
 //! thin one between its halves.
 //! Sextupoles are left out: on the reference orbit they do nothing to first order in the kicks.
+
+use std::collections::BTreeSet;
 
 use serde_json::{Value, json};
 use twin::{Plane, Ring};
 
 use crate::error::MeasuredError;
 use crate::folder::{Folder, Row};
-use crate::unknowns::Magnets;
+use crate::unknowns::{Magnets, groups};
 
 /// `1/gamma` where no energy is stated: its square is below a thousandth of any ring's momentum compaction.
 const ULTRA_RELATIVISTIC: f64 = 1e-4;
@@ -29,9 +31,10 @@ pub fn ring(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Result<Ring
 /// The same as a machine file, docs/machine.md.
 pub fn machine(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Value {
     let mut elements = Vec::new();
+    let fitted: BTreeSet<usize> = groups(folder)[0].iter().flatten().copied().collect();
     for (row, one) in folder.lattice.iter().enumerate() {
         let name = folder.element(row);
-        elements.extend(magnet(one, &name, cut.contains(&row)));
+        elements.extend(magnet(one, &name, (cut.contains(&row), fitted.contains(&row))));
         let planes = |of: &mut dyn Iterator<Item = (usize, Plane)>| {
             let planes: Vec<Plane> = of.filter(|(at, _)| *at == row).map(|(_, plane)| plane).collect();
             match (planes.contains(&Plane::X), planes.contains(&Plane::Y)) {
@@ -63,6 +66,17 @@ pub fn machine(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Value {
     })
 }
 
+/// Rows along which a corrector acts that is a winding of a magnet with a field: the halves of its name on both sides of its row, which has no length.
+pub fn winding(folder: &Folder, at: usize) -> Option<[usize; 2]> {
+    let halves = [at.checked_sub(1)?, at + 1];
+    let has_field = |row: &Row| row.length > 0.0 && (row.k1 != 0.0 || row.bend != 0.0);
+    let is_half = |&row: &usize| {
+        let half = folder.lattice.get(row);
+        half.is_some_and(|half| half.name == folder.lattice[at].name && has_field(half))
+    };
+    (folder.lattice[at].length == 0.0 && halves.iter().all(is_half)).then_some(halves)
+}
+
 /// Names of the elements that make a row's magnet: those with a gradient, and the thin skew gradient.
 pub fn parts(name: &str, has_skew: bool) -> (Vec<String>, Option<String>) {
     match has_skew {
@@ -88,7 +102,8 @@ fn lenses(folder: &Folder, rows: &[usize]) -> Vec<Value> {
     lens_names(folder, rows).enumerate().map(lens).collect()
 }
 
-fn magnet(row: &Row, name: &str, has_skew: bool) -> Vec<Value> {
+/// With a thin gradient in its middle, and with a gradient of its own that is fitted: a factor, or one that is added where there is none.
+fn magnet(row: &Row, name: &str, (has_skew, is_fitted): (bool, bool)) -> Vec<Value> {
     let (names, thin) = parts(name, has_skew);
     let pieces = names.len();
     let length = row.length / pieces as f64;
@@ -107,9 +122,13 @@ fn magnet(row: &Row, name: &str, has_skew: bool) -> Vec<Value> {
                 // of the integral and the half gap twice the product acts, at both ends of every piece
                 (one["fint"], one["hgap"]) = (json!(0.5), json!(row.fringe / pieces as f64));
             }
-        } else if row.k1 != 0.0 {
+        } else if row.k1 != 0.0 || is_fitted {
             one["type"] = json!("quadrupole");
             one["k1"] = json!(row.k1);
+            // a factor of nothing is none
+            if row.k1 == 0.0 || !is_fitted {
+                one["fit"] = json!(false);
+            }
         } else {
             continue;
         }

@@ -12,7 +12,7 @@ use twin::{Gradient, Hold, Kind as Field, LatticeError, Observer, Optics, Plane,
 
 use crate::error::MeasuredError;
 use crate::folder::Folder;
-use crate::lattice::{LENSES, lens_names, parts, ring};
+use crate::lattice::{LENSES, lens_names, parts, ring, winding};
 use crate::unknowns::{Groups, Kind, Unknown};
 
 /// Millimetres a metre.
@@ -31,9 +31,10 @@ pub struct Model {
     skews: Vec<Vec<usize>>,
     gradients: Vec<Vec<usize>>,
     wigglers: Vec<Vec<usize>>,
-    /// Element of each monitor's row and of each corrector's column, with the plane.
+    /// Element of each monitor's row, with the plane.
     monitors: Vec<(usize, Plane)>,
-    correctors: Vec<(usize, Plane)>,
+    /// Elements along which each corrector kicks, with their shares of the kick, and the plane.
+    correctors: Vec<(Vec<(usize, f64)>, Plane)>,
     /// Kicks as believed [mrad].
     kicks: Vec<f64>,
 }
@@ -81,7 +82,16 @@ impl Model {
         let wigglers = groups[3].iter().map(lenses).collect::<Result<_, LatticeError>>()?;
         let place = |kind: &str, at: usize| ring.element(&format!("{kind} {}", folder.element(at)));
         let monitors = folder.monitors.iter().map(|one| Ok((place("bpm", one.at)?, one.plane)));
-        let correctors = folder.correctors.iter().map(|one| Ok((place("corrector", one.at)?, one.plane)));
+        let correctors = folder.correctors.iter().map(|one| {
+            let Some(halves) = winding(folder, one.at) else {
+                return Ok((vec![(place("corrector", one.at)?, 1.0)], one.plane));
+            };
+            let pieces = halves.into_iter().flat_map(|row| named(row).0).map(|name| ring.element(&name));
+            let pieces = pieces.collect::<Result<Vec<usize>, _>>()?;
+            let length = |at: usize| ring.elements[at].length;
+            let whole: f64 = pieces.iter().map(|&at| length(at)).sum();
+            Ok((pieces.into_iter().map(|at| (at, length(at) / whole)).collect(), one.plane))
+        });
         let monitors = monitors.collect::<Result<_, MeasuredError>>()?;
         let correctors = correctors.collect::<Result<_, MeasuredError>>()?;
         let kicks = folder.correctors.iter().map(|one| one.kick).collect();
@@ -113,10 +123,10 @@ impl Model {
         let mut ring = self.ring.clone();
         for (unknown, &value) in unknowns.iter().zip(values) {
             match unknown.kind {
-                Kind::Strength(group) => {
+                Kind::Strength(group) | Kind::Added(group) => {
                     for &element in &self.strengths[group] {
                         if let Some(k1) = gradient_mut(&mut ring.elements[element].kind) {
-                            *k1 *= value;
+                            *k1 = unknown.kind.gradient(*k1, value);
                         }
                     }
                 }
@@ -177,10 +187,27 @@ impl Model {
         places.map(|(&(at, plane), &weights)| optics.observe_along(at, along(plane, weights))).collect()
     }
 
-    /// Correctors with what each kicks in both planes [mrad].
+    /// Pieces of correctors with what each kicks in both planes [mrad].
     fn sources(&self, optics: &Optics, weights: &[[f64; 2]]) -> Vec<Source> {
-        let places = self.correctors.iter().zip(weights).zip(&self.kicks);
-        places.map(|((&(at, plane), &weights), &kick)| optics.kick(at, along(plane, weights)).times(kick)).collect()
+        let correctors = self.correctors.iter().zip(weights).zip(&self.kicks);
+        let pieces = correctors.flat_map(|(((pieces, plane), &weights), &kick)| {
+            pieces.iter().map(move |&(at, share)| optics.winding(at, along(*plane, weights)).times(share * kick))
+        });
+        pieces.collect()
+    }
+
+    /// Columns of the pieces added up to those of the correctors.
+    fn of_correctors(&self, of_pieces: DMatrix<f64>) -> DMatrix<f64> {
+        if of_pieces.ncols() == self.correctors.len() {
+            return of_pieces;
+        }
+        let mut sum = DMatrix::zeros(of_pieces.nrows(), self.correctors.len());
+        let columns = self.correctors.iter().enumerate().flat_map(|(column, (pieces, _))| vec![column; pieces.len()]);
+        for (column, piece) in columns.zip(of_pieces.column_iter()) {
+            let mut into = sum.column_mut(column);
+            into += piece;
+        }
+        sum
     }
 
     /// The prediction of one kind of hold.
@@ -202,23 +229,24 @@ impl Model {
 
     /// What observers see of sources [mm], and of a step of the RF frequency, `rf` times as large as it is believed to be.
     fn seen(&self, optics: &Optics, observers: &[Observer], sources: &[Source], rf: f64) -> DMatrix<f64> {
-        let seen = optics.response(observers, sources);
+        let seen = self.of_correctors(optics.response(observers, sources));
         let offset = || optics.dispersion_of(observers) * (-rf * self.rf_step * MILLI / optics.slip_factor());
         self.and_dispersion(seen, offset)
     }
 
-    /// Gradient of each element of each group per unit of the group's factor [1/m^2]: a magnet may have a factor of its own and one that it shares.
+    /// Gradient of each element of each group per unit of the group's factor [1/m^2], since a magnet may have a factor of its own and one that it shares;
+    /// 1 where a gradient is added.
     fn gradients_of_factors(&self, unknowns: &[Unknown], values: &DVector<f64>, ring: &Ring) -> Vec<Vec<f64>> {
-        let mut factors = vec![1.0; self.strengths.len()];
+        let now = |group: &Vec<usize>| group.iter().map(|&at| gradient(&ring.elements[at].kind)).collect::<Vec<f64>>();
+        let mut each: Vec<Vec<f64>> = self.strengths.iter().map(now).collect();
         for (unknown, &value) in unknowns.iter().zip(values) {
-            if let Kind::Strength(group) = unknown.kind {
-                factors[group] = value;
+            match unknown.kind {
+                Kind::Strength(group) => each[group].iter_mut().for_each(|k1| *k1 /= value),
+                Kind::Added(group) => each[group].fill(1.0),
+                _ => {}
             }
         }
-        let each = |(group, factor): (&Vec<usize>, f64)| {
-            group.iter().map(|&at| gradient(&ring.elements[at].kind) / factor).collect()
-        };
-        self.strengths.iter().zip(factors).map(each).collect()
+        each
     }
 
     /// Derivatives of the same by strengths, skew gradients and further gradients.
@@ -256,7 +284,7 @@ impl Model {
         let each = optics.response_jacobian(observers, sources, gradients);
         let sum = each.into_iter().reduce(|sum, one| sum + one);
         let offset = || optics.rf_jacobian(observers, gradients).column_sum() * (rf * self.rf_step * MILLI);
-        self.and_dispersion(sum.expect("a group has a magnet"), offset)
+        self.and_dispersion(self.of_correctors(sum.expect("a group has a magnet")), offset)
     }
 
     /// A matrix with the dispersion as its last column, if it was measured.
@@ -285,7 +313,7 @@ impl Model {
                 Kind::CorrectorCoupling(column) => all.correctors[column][1] = value,
                 Kind::RfScale => all.rf = value,
                 Kind::HeldFrequency => all.held_frequency = Some(value),
-                Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => {}
+                Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => {}
             }
         }
         all
@@ -337,7 +365,7 @@ fn along(plane: Plane, [own, other]: [f64; 2]) -> [f64; 2] {
 mod tests {
     use super::*;
     use crate::normal::Places;
-    use crate::testing::{machine, ring};
+    use crate::testing::{machine, ring, ring_with_winding};
 
     /// A gradient spread over a short quadrupole changes what a thin one in its middle does.
     #[test]
@@ -361,7 +389,11 @@ mod tests {
 
     #[test]
     fn derivatives_are_those_of_differences() {
-        let folder = ring();
+        let mut folder = ring_with_winding();
+        // a gradient that is added to dipoles, as one unknown
+        let dipoles = (0..folder.lattice.len()).filter(|&row| folder.lattice[row].bend != 0.0).collect();
+        let added = crate::folder::Group { elements: dipoles, field: "K".into() };
+        folder.meta.reference_fit.as_mut().unwrap().fit_parameters.insert(3, added);
         let (_, mut unknowns, mut values) = machine(&folder, 3);
         // a further gradient and a skew gradient in a dipole and in a quadrupole
         let [strengths, skews, ..] = crate::unknowns::groups(&folder);
@@ -374,7 +406,7 @@ mod tests {
         }
         let magnets = unknowns
             .iter()
-            .filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_)))
+            .filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_)))
             .count();
         // between the two holds both count
         unknowns.insert(magnets, Unknown { kind: Kind::HeldFrequency, mean: 1.0, width: 1.0 });

@@ -31,9 +31,12 @@ impl Places {
         let mut places = Self { machine: 0, rows: vec![[None; 2]; rows], columns: vec![[None; 2]; columns] };
         for (at, unknown) in unknowns.iter().enumerate() {
             match unknown.kind {
-                Kind::Strength(_) | Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::HeldFrequency => {
-                    places.machine += 1
-                }
+                Kind::Strength(_)
+                | Kind::Added(_)
+                | Kind::Skew(_)
+                | Kind::Gradient(_)
+                | Kind::Wiggler(_)
+                | Kind::HeldFrequency => places.machine += 1,
                 Kind::MonitorGain(row) => places.rows[row][0] = Some(at),
                 Kind::MonitorCoupling(row) => places.rows[row][1] = Some(at),
                 Kind::CorrectorGain(column) => places.columns[column][0] = Some(at),

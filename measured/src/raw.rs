@@ -6,7 +6,7 @@ use nalgebra::DMatrix;
 use serde::Deserialize;
 
 use crate::error::MeasuredError;
-use crate::folder::{Folder, table, text};
+use crate::folder::{Folder, number, table, text};
 use crate::wiring::Wiring;
 
 /// Pairs of orbits, as they were read.
@@ -19,6 +19,9 @@ pub struct RawOrbits {
     /// Current from minus to plus half the kick, by corrector [A].
     pub amperes: Vec<f64>,
 }
+
+/// No beam pipe is wider: an orbit stays within it [mm].
+const WIDEST: f64 = 1e3;
 
 const MINUS: &str = "raw_orbit_minus_mm.csv";
 const PLUS: &str = "raw_orbit_plus_mm.csv";
@@ -80,7 +83,10 @@ impl RawOrbits {
     /// The same with cables that were found wrong put right.
     pub fn with_cables(mut self, folder: &Folder, cables: &[Wiring]) -> Self {
         let mut apart = Folder { matrix: self.change, ..folder.clone() };
+        // a supply keeps its current as it keeps its kick
+        apart.correctors.iter_mut().zip(&self.amperes).for_each(|(one, amperes)| one.kick = *amperes);
         cables.iter().for_each(|one| one.put_right(&mut apart));
+        self.amperes = apart.correctors.iter().map(|one| one.kick).collect();
         self.change = core::mem::replace(&mut apart.matrix, self.middle);
         // the sign of a kick does not turn the orbit without it
         let of_orbit = |one: &&Wiring| !matches!(one, Wiring::CorrectorReversed(_) | Wiring::PlaneReversed(_));
@@ -118,9 +124,14 @@ fn numbers(file: &Path, columns: usize) -> Result<DMatrix<f64>, MeasuredError> {
             return Err(table(file, problem));
         }
         for (column, field) in record.iter().enumerate() {
-            let refused =
-                |_| table(file, format!("line {rows}, column {}: expected a number, found {field}", column + 1));
-            all.push(if field.trim().is_empty() { f64::NAN } else { field.trim().parse().map_err(refused)? });
+            let place = format!("line {rows}, column {}", column + 1);
+            match number(field) {
+                Some(orbit) if orbit.abs() > WIDEST => {
+                    return Err(table(file, format!("{place}: {orbit} mm, expected {WIDEST} mm at most")));
+                }
+                Some(orbit) => all.push(orbit),
+                None => return Err(table(file, format!("{place}: expected a number, found {field}"))),
+            }
         }
     }
     Ok(DMatrix::from_row_slice(rows, columns, &all))
@@ -162,6 +173,10 @@ mod tests {
         assert_eq!(
             read("1,2\n", "1,a\n", META).unwrap_err(),
             "raw_orbit_plus_mm.csv: line 1, column 2: expected a number, found a"
+        );
+        assert_eq!(
+            read("1,2\n", "1,-2e3\n", META).unwrap_err(),
+            "raw_orbit_plus_mm.csv: line 1, column 2: -2000 mm, expected 1000 mm at most"
         );
         assert_eq!(
             read("1,2\n", "1,2\n3,4\n", META).unwrap_err(),

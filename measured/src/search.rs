@@ -109,7 +109,7 @@ fn expected(kind: Kind) -> f64 {
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) => 0.3,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.1,
         Kind::Strength(_) => 0.2,
-        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => 0.1,
+        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::Added(_) => 0.1,
         Kind::RfScale | Kind::HeldFrequency => 0.0,
     }
 }

@@ -66,6 +66,25 @@ pub fn ring() -> Folder {
     Folder { name: "ring".into(), meta, lattice, monitors, correctors, matrix, dispersion }
 }
 
+/// The ring with one corrector, of column 2, as a winding of the quadrupole before it, which is cut in its middle.
+pub fn ring_with_winding() -> Folder {
+    let mut ring = ring();
+    let magnet = (0..ring.lattice.len()).find(|&row| ring.lattice[row].name == "QF" && row > 10).expect("it has QF");
+    let half = Row { length: ring.lattice[magnet].length / 2.0, ..ring.lattice[magnet].clone() };
+    let middle = Row { s: half.s + half.length, length: 0.0, k1: 0.0, ..half.clone() };
+    ring.lattice.splice(magnet..=magnet, [half.clone(), middle.clone(), Row { s: middle.s, ..half }]);
+    let behind = |row: usize| if row > magnet { row + 2 } else { row };
+    ring.monitors.iter_mut().for_each(|one| one.at = behind(one.at));
+    ring.correctors.iter_mut().for_each(|one| one.at = behind(one.at));
+    for group in ring.meta.reference_fit.iter_mut().flat_map(|fit| &mut fit.fit_parameters) {
+        let is_it = group.elements.contains(&magnet);
+        group.elements =
+            if is_it { vec![magnet, magnet + 2] } else { group.elements.iter().map(|&row| behind(row)).collect() };
+    }
+    ring.correctors[2].at = magnet + 1;
+    ring
+}
+
 /// Normal numbers of unit width, fixed by a seed.
 pub fn normal(seed: u64) -> impl FnMut() -> f64 {
     let mut random = StdRng::seed_from_u64(seed);
@@ -76,14 +95,14 @@ pub fn normal(seed: u64) -> impl FnMut() -> f64 {
 pub fn machine(folder: &Folder, seed: u64) -> (Model, Vec<Unknown>, DVector<f64>) {
     let groups = groups(folder);
     let model = Model::of(folder, &groups, Rf::FixedFrequency).unwrap();
-    let all = unknowns(folder, [&groups[0], &groups[1]].map(Vec::len), true, &Widths::default());
+    let all = unknowns(folder, &groups, true, &Widths::default());
     let mut normal = normal(seed);
     let size = |kind: Kind| match kind {
         Kind::Strength(_) => 0.01,
         Kind::Skew(_) => 0.002,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) => 0.03,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.01,
-        Kind::Gradient(_) | Kind::Wiggler(_) | Kind::RfScale | Kind::HeldFrequency => 0.0,
+        Kind::Gradient(_) | Kind::Added(_) | Kind::Wiggler(_) | Kind::RfScale | Kind::HeldFrequency => 0.0,
     };
     let values = all.iter().map(|one| one.mean + size(one.kind) * normal());
     let values = DVector::from_iterator(all.len(), values);

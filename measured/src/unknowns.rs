@@ -13,6 +13,8 @@ pub enum Kind {
     Gradient(usize),
     /// Integrated vertical focusing in the middle of a straight [1/m], as of a wiggler.
     Wiggler(usize),
+    /// Gradient of each magnet of a group of gradients whose own is 0, all along it [1/m^2].
+    Added(usize),
     /// Share of the orbit that a held RF frequency adds, 1 where it is held and 0 where the momentum is.
     HeldFrequency,
     /// What a monitor reads of its own plane: 1 if it is right, 0 if it is dead.
@@ -35,6 +37,7 @@ impl Kind {
             Self::Skew(_) => "skew_gradient",
             Self::Gradient(_) => "stray_gradient",
             Self::Wiggler(_) => "wiggler_focusing",
+            Self::Added(_) => "added_gradient",
             Self::HeldFrequency => "fixed_rf_frequency",
             Self::MonitorGain(_) => "bpm_gain",
             Self::MonitorCoupling(_) => "bpm_coupling",
@@ -42,6 +45,11 @@ impl Kind {
             Self::CorrectorCoupling(_) => "corrector_coupling",
             Self::RfScale => "rf_scale",
         }
+    }
+
+    /// Gradient of a magnet [1/m^2] whose own is `k1`, at a value of the unknown that it is of.
+    pub fn gradient(self, k1: f64, value: f64) -> f64 {
+        if matches!(self, Self::Added(_)) { k1 + value } else { k1 * value }
     }
 }
 
@@ -70,7 +78,7 @@ pub type Groups = [Vec<Magnets>; 4];
 pub struct Widths {
     /// Of a strength factor.
     pub strength: f64,
-    /// Of an integrated skew gradient [1/m].
+    /// Of an integrated skew gradient, and of an integrated gradient where the lattice has none [1/m].
     pub skew: f64,
     /// Of the integrated vertical focusing of a straight [1/m].
     pub wiggler: f64,
@@ -88,11 +96,10 @@ impl Default for Widths {
     }
 }
 
-/// Groups of gradients and of skew gradients: those of the reference fit, else every quadrupole by itself.
+/// Groups of gradients and of skew gradients: those of the reference fit, else every quadrupole and every dipole with a gradient by itself.
 pub fn groups(folder: &Folder) -> Groups {
-    let quadrupoles = |row: &Row| row.k1 != 0.0 && row.bend == 0.0;
     let Some(reference) = &folder.meta.reference_fit else {
-        return [magnets(folder, quadrupoles), Vec::new(), Vec::new(), Vec::new()];
+        return [magnets(folder, |row| row.k1 != 0.0), Vec::new(), Vec::new(), Vec::new()];
     };
     let of = |is_gradient: bool| {
         let groups = reference.fit_parameters.iter().filter(move |one| (one.field == "K") == is_gradient);
@@ -147,11 +154,20 @@ pub fn straights(folder: &Folder) -> Vec<Magnets> {
     free.filter(|rows| length(rows) > STRAIGHT).map(device).collect()
 }
 
+/// What is fitted of a group of gradients: a factor, or a gradient that is added where the lattice has none.
+fn of_gradients(folder: &Folder, group: usize, rows: &Magnets, widths: &Widths) -> Unknown {
+    let magnets = rows.iter().map(|&row| &folder.lattice[row]);
+    if magnets.clone().any(|one| one.k1 != 0.0) {
+        return Unknown { kind: Kind::Strength(group), mean: 1.0, width: widths.strength };
+    }
+    let length = magnets.map(|one| one.length).sum::<f64>() / rows.len() as f64;
+    Unknown { kind: Kind::Added(group), mean: 0.0, width: widths.skew / length }
+}
+
 /// All unknowns of a measurement, magnets first.
-pub fn unknowns(folder: &Folder, [strengths, skews]: [usize; 2], coupling: bool, widths: &Widths) -> Vec<Unknown> {
-    let magnets =
-        (0..strengths).map(|group| Unknown { kind: Kind::Strength(group), mean: 1.0, width: widths.strength });
-    let skews = (0..skews).map(|group| Unknown { kind: Kind::Skew(group), mean: 0.0, width: widths.skew });
+pub fn unknowns(folder: &Folder, groups: &Groups, coupling: bool, widths: &Widths) -> Vec<Unknown> {
+    let magnets = groups[0].iter().enumerate().map(|(group, rows)| of_gradients(folder, group, rows, widths));
+    let skews = (0..groups[1].len()).map(|group| Unknown { kind: Kind::Skew(group), mean: 0.0, width: widths.skew });
     let monitors = (0..folder.monitors.len()).filter(|&row| folder.monitors[row].is_used);
     let monitors = monitors.flat_map(|row| {
         [
@@ -196,6 +212,7 @@ fn strengths(folder: &Folder, groups: &[Magnets], group: &Magnets) -> String {
 pub fn name(folder: &Folder, groups: &Groups, kind: Kind) -> String {
     match kind {
         Kind::Strength(group) => strengths(folder, &groups[0], &groups[0][group]),
+        Kind::Added(group) => folder.element(groups[0][group][0]),
         Kind::Skew(group) => folder.element(groups[1][group][0]),
         Kind::Gradient(group) => folder.element(groups[2][group][0]),
         Kind::Wiggler(group) => folder.element(groups[3][group][groups[3][group].len() / 2]),

@@ -60,11 +60,18 @@ pub fn straightened(folder: &Folder, settings: &Settings) -> Result<(Folder, Vec
 pub fn straightened_by(folder: &Folder, expected: &DMatrix<f64>) -> (Folder, Vec<Wiring>) {
     let (mut right, mut all) = exchanged_back(folder, expected);
     // an exchanged line may be reversed too, which shows at its own place
-    for one in reversed(&right, expected) {
+    for one in reversed(&right, &with_kicks_of(&right, folder, expected)) {
         one.put_right(&mut right);
         all.push(one);
     }
     (right, all)
+}
+
+/// What one folder's kicks make of the matrix that is expected with those of another [mm].
+fn with_kicks_of(folder: &Folder, other: &Folder, expected: &DMatrix<f64>) -> DMatrix<f64> {
+    let kick = |folder: &Folder, column: usize| folder.correctors.get(column).map_or(1.0, |one| one.kick);
+    let share = |column| if kick(other, column) == 0.0 { 1.0 } else { kick(folder, column) / kick(other, column) };
+    DMatrix::from_fn(expected.nrows(), expected.ncols(), |i, j| expected[(i, j)] * share(j))
 }
 
 /// The measurement with exchanged rows and columns put back, the clearest first: a row that is at a wrong place is in the way where columns are
@@ -171,6 +178,9 @@ impl Wiring {
             Self::CorrectorsExchanged(columns) => {
                 for pair in columns.windows(2).rev() {
                     folder.matrix.swap_columns(pair[0], pair[1]);
+                    // a supply keeps its kick, whichever magnet its cable leads to
+                    let [one, other] = [pair[0], pair[1]].map(|column| folder.correctors[column].kick);
+                    (folder.correctors[pair[0]].kick, folder.correctors[pair[1]].kick) = (other, one);
                 }
             }
             Self::MonitorReversed(row) => {
@@ -211,8 +221,10 @@ impl Wiring {
         };
         let (rows, columns) = right.matrix.shape();
         let elements = (0..columns).flat_map(|column| (0..rows).map(move |row| (row, column)));
+        let of_wrong = with_kicks_of(&wrong, right, predicted);
         let off = elements.filter(|&(row, column)| changed(row, column)).map(|(row, column)| {
-            let [wrong, right] = [&wrong, right].map(|folder| folder.matrix[(row, column)] - predicted[(row, column)]);
+            let [wrong, right] = [(&wrong, &of_wrong), (right, predicted)]
+                .map(|(folder, predicted)| folder.matrix[(row, column)] - predicted[(row, column)]);
             // a dead one is compared with what it reads
             let right = if matches!(self, Self::MonitorsDead(_) | Self::CorrectorsDead(_)) { 0.0 } else { right };
             (wrong * wrong - right * right) / error(row, column).powi(2)
@@ -365,6 +377,22 @@ mod tests {
             assert_eq!(found, [wrong]);
             assert_eq!((right.matrix, right.dispersion), (plain.matrix, plain.dispersion));
         }
+    }
+
+    /// A supply of thrice the kick at its neighbour's magnet: its column is at the neighbour's place, and so is its kick.
+    #[test]
+    fn kicks_go_with_the_columns_of_exchanged_cables() {
+        let mut ring = ring();
+        ring.correctors[5].kick *= 3.0;
+        let plain = measured(&ring, &machine(&ring, 12), NOISE, 1);
+        let (mut folder, cable) = (plain.clone(), Wiring::CorrectorsExchanged(vec![4, 5]));
+        cable.put_right(&mut folder);
+        // the folder as it is written has the kicks of the supplies, in the order of the columns
+        assert_eq!(folder.correctors[4].kick, 3.0 * folder.correctors[5].kick);
+        let (right, found) = straightened(&folder, &Settings::default()).unwrap();
+        assert_eq!(found, [cable]);
+        assert_eq!(right.matrix, plain.matrix);
+        assert!(right.correctors.iter().zip(&plain.correctors).all(|(right, plain)| right.kick == plain.kick));
     }
 
     /// Three in a ring: row 1 has what monitor 4 reads, row 4 what monitor 9 reads, row 9 what monitor 1 reads.

@@ -506,13 +506,13 @@ impl From<Format> for export::Format {
 pub struct Import {
     /// Lattice by pyAT or Xsuite (JSON), AT (MAT-file), MAD-X (twiss table) or in PALS; or a LOCO file (MAT-file), which has the matrix too
     pub lattice: PathBuf,
-    /// The measured response matrix: a plain table, FILE.h5:/PATH or FILE.mat:NAME; without it, the lattice is shown and nothing is written
+    /// The measured response matrix: a plain table, FILE.h5:/PATH, FILE.mat:NAME or one of the Matlab Middle Layer; without it, the lattice is shown and nothing is written
     #[arg(long, value_name = "FILE", requires = "out")]
     pub matrix: Option<PathBuf>,
     /// Folder that is made
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Monitors by name, such as 'BPM*' or 'x:BPMH*', repeatable; by type without it
+    /// Monitors by name, such as 'BPM*' or 'x:BPMH*', or by a field of an AT file, 'CommonName=BPM*', repeatable; by type without it
     #[arg(long, value_name = "PATTERN")]
     pub monitors: Vec<Pattern>,
     /// Correctors by name in the same way

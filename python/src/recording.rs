@@ -185,7 +185,7 @@ impl Recording {
     /// The ring of a matrix that was read, on its own lattice.
     fn ring_of_matrix(&self) -> PyResult<Ring> {
         match &self.data {
-            Data::Matrix(folder) => Ring::machine(machine(folder, &[]).to_string(), folder.name.clone()),
+            Data::Matrix(folder) => Ring::machine(machine(folder, &[], &[]).to_string(), folder.name.clone()),
             Data::Frames(_) => Err(input(format!("{} is a recording of frames, not a measured matrix", self.name()))),
         }
     }

@@ -46,6 +46,7 @@ impl Imported {
     /// `InputError`.
     pub fn parse(text: String, file: String, monitors: Vec<String>, correctors: Vec<String>) -> PyResult<Self> {
         let lattice = Lattice::parse(&file, &text).map_err(input)?;
+        lattice.expect_ring().map_err(input)?;
         let instruments =
             Instruments::choose(&lattice, &patterns(&monitors)?, &patterns(&correctors)?).map_err(input)?;
         Ok(Self { text, file, monitors, correctors, of: Arc::new((lattice, instruments)) })
@@ -69,7 +70,7 @@ impl Source {
             Self::Lattice(imported) => {
                 let name = Path::new(&imported.file).file_name().unwrap_or_default().to_string_lossy().into_owned();
                 let folder = Folder { name, ..imported.folder().map_err(input)? };
-                twin::Ring::parse(&machine(&folder, &[]).to_string(), &folder.name).map_err(input)
+                twin::Ring::parse(&machine(&folder, &[], &[]).to_string(), &folder.name).map_err(input)
             }
         }
     }

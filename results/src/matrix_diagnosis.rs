@@ -10,7 +10,7 @@ use serde::Serialize;
 use twin::Rf;
 
 use crate::fit_result::Monitor;
-use crate::matrix_result::{DOUBT, MatrixFit, MatrixVar, fitted_rows};
+use crate::matrix_result::{DOUBT, MatrixFit, MatrixVar, Other, fitted_rows, others};
 use crate::output::{fill, table};
 
 /// Findings that the sentence says.
@@ -35,6 +35,9 @@ pub struct MatrixDiagnosis {
     pub fit: Predictions,
     pub vars_before: Vec<MatrixVar>,
     pub vars_after: Vec<MatrixVar>,
+    /// Gradients that are added, beside `vars_after`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub other: Vec<Other>,
     /// The fit as LOCO has it.
     pub loco: MatrixFit,
 }
@@ -142,6 +145,9 @@ impl MatrixDiagnosis {
         };
         let hierarchy = &diagnosis.hierarchy;
         let var = |&(row, group): &(usize, usize)| MatrixVar::of_row(folder, row, hierarchy.strength(group));
+        let value = |unknown: usize| [hierarchy.values[unknown], hierarchy.uncertainty.sigma[unknown]];
+        let mut other = others(folder, (&hierarchy.groups, &hierarchy.unknowns), value);
+        other.retain(|one| !one.elements.is_empty());
         let unexplained = diagnosis.unexplained.iter();
         let unexplained =
             unexplained.map(|one| UnexplainedResult { at: one.at.clone(), rms_um: 1e3 * one.rms, ratio: one.ratio });
@@ -157,6 +163,7 @@ impl MatrixDiagnosis {
             fit: Predictions::from(&diagnosis.held_out),
             vars_before: loco.vars.clone(),
             vars_after: fitted_rows(fitted).iter().map(var).collect(),
+            other,
             loco,
         }
     }
@@ -188,8 +195,11 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
 
 /// Unit of an amplitude.
 fn unit(kind: &str) -> &'static str {
-    let is_integrated = ["skew_gradient", "stray_gradient", "dipole_gradient", "wiggler_focusing"].contains(&kind);
-    if is_integrated { "1/m" } else { "1" }
+    match kind {
+        "skew_gradient" | "stray_gradient" | "dipole_gradient" | "wiggler_focusing" => "1/m",
+        "added_gradient" => "1/m^2",
+        _ => "1",
+    }
 }
 
 /// A relative distance as people read it.
@@ -201,7 +211,7 @@ fn beside(amplitude: f64, sigma: f64) -> String {
 /// A number as people read it.
 fn number(value: f64, unit: &str) -> String {
     match unit {
-        "1/m" => format!("{value:.5} /m"),
+        "1/m" | "1/m^2" => format!("{value:.5} {}", &unit[1..]),
         _ => format!("{:.2} %", 1e2 * value),
     }
 }
@@ -209,7 +219,7 @@ fn number(value: f64, unit: &str) -> String {
 /// An amplitude as people read it.
 fn size(amplitude: f64, sigma: f64, unit: &str) -> String {
     match unit {
-        "1/m" => format!("{amplitude:+.5} ± {sigma:.5} /m"),
+        "1/m" | "1/m^2" => format!("{amplitude:+.5} ± {sigma:.5} {}", &unit[1..]),
         _ => format!("{:+.2} ± {:.2} %", 1e2 * amplitude, 1e2 * sigma),
     }
 }

@@ -319,7 +319,7 @@ impl Measured<'_> {
 fn findings(found: &MatrixDiagnosis) -> Section {
     let size = |amplitude: f64, sigma: f64, unit: &str| match (sigma > 0.0, unit) {
         (false, _) => String::new(),
-        (true, "1/m") => format!("{amplitude:+.5} ± {sigma:.5} /m"),
+        (true, "1/m" | "1/m^2") => format!("{amplitude:+.5} ± {sigma:.5} {}", &unit[1..]),
         (true, _) => format!("{amplitude:+.4} ± {sigma:.4}"),
     };
     let row = |one: &MatrixFinding| {
@@ -334,7 +334,7 @@ fn findings(found: &MatrixDiagnosis) -> Section {
     };
     let ordinary = |one: &ImperfectionResult| {
         let number = |value: f64| match one.unit {
-            "1/m" => format!("{value:.5} /m"),
+            "1/m" | "1/m^2" => format!("{value:.5} {}", &one.unit[1..]),
             _ => format!("{:.2} %", 1e2 * value),
         };
         let numbers = [one.mean, one.scatter, one.sigma].map(number);

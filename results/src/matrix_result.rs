@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use comfy_table::CellAlignment;
 use measured::believed::{Believed, Value};
 use measured::straight::DEAD;
-use measured::unknowns::name;
+use measured::unknowns::{Groups, Unknown, name};
 use measured::{Fit, Folder, Kind, Wiring};
 use serde::{Deserialize, Serialize};
 
@@ -68,6 +68,9 @@ pub struct MatrixVar {
 pub struct Other {
     pub kind: &'static str,
     pub at: String,
+    /// All magnets of a gradient that is added.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub elements: Vec<String>,
     pub mean: f64,
     pub sigma: f64,
 }
@@ -133,10 +136,7 @@ impl MatrixFit {
         let between =
             |&(_, i): &(usize, usize)| rows.iter().map(|&(_, j)| scale(i) * scale(j) * independent[(i, j)]).collect();
         let called = |at: usize| name(folder, &fit.groups, fit.unknowns[at].kind);
-        let other = fit.unknowns.iter().enumerate().filter_map(|(at, unknown)| {
-            let kind = (!matches!(unknown.kind, Kind::Strength(_))).then(|| unknown.kind.word())?;
-            Some(Other { kind, at: called(at), mean: fit.values[at], sigma: fit.sigma(at) })
-        });
+        let value = |at: usize| [fit.values[at], fit.sigma(at)];
         let weight = fit.data.weight(&fit.missed, &fit.residual);
         let chi2 = fit.residual.component_mul(&fit.residual).dot(&weight);
         Self {
@@ -145,17 +145,14 @@ impl MatrixFit {
             model: "twin",
             elements: fit.elements,
             rejected_elements: fit.outliers.len(),
-            vars: rows
-                .iter()
-                .map(|&(row, at)| MatrixVar::of_row(folder, row, [fit.values[at], fit.sigma(at)]))
-                .collect(),
+            vars: rows.iter().map(|&(row, at)| MatrixVar::of_row(folder, row, value(at))).collect(),
             covariance: rows.iter().map(between).collect(),
             chi2_per_dof: chi2 / (fit.elements as f64 - fit.unknowns.len() as f64).max(1.0),
             chi2_loco: fit.chi2_loco,
             chi2_loco_start: fit.chi2_start,
             tunes: tunes.map(|[x, y]| Tunes { x, y }),
             monitors: monitors(folder, fit),
-            other: other.collect(),
+            other: others(folder, (&fit.groups, &fit.unknowns), value),
             degenerate: fit.degenerate().iter().map(|set| set.iter().map(|&at| called(at)).collect()).collect(),
             model_error: model_error(fit),
             wiring: cables.iter().map(|one| one.named(folder)).map(|(kind, at)| Cable { kind, at }).collect(),
@@ -164,11 +161,33 @@ impl MatrixFit {
     }
 }
 
-/// Rows of the lattice whose strengths are fitted, in beam order, with the number of their group, which is that of their unknown.
+/// Everything that is no strength factor, with its mean and its standard deviation.
+pub(crate) fn others(
+    folder: &Folder,
+    (groups, unknowns): (&Groups, &[Unknown]),
+    value: impl Fn(usize) -> [f64; 2],
+) -> Vec<Other> {
+    let other = |(at, unknown): (usize, &Unknown)| {
+        let kind = unknown.kind;
+        let elements = match kind {
+            Kind::Added(group) => groups[0][group].iter().map(|&row| folder.element(row)).collect(),
+            _ => Vec::new(),
+        };
+        let [mean, sigma] = value(at);
+        Other { kind: kind.word(), at: name(folder, groups, kind), elements, mean, sigma }
+    };
+    let others = unknowns.iter().enumerate().filter(|(_, unknown)| !matches!(unknown.kind, Kind::Strength(_)));
+    others.map(other).collect()
+}
+
+/// Rows of the lattice whose strengths have a factor, in beam order, with the number of their group, which is that of their unknown.
 pub(crate) fn fitted_rows(fit: &Fit) -> Vec<(usize, usize)> {
-    let of_group =
-        |(number, rows): (usize, &Vec<usize>)| rows.iter().map(move |&row| (row, number)).collect::<Vec<_>>();
-    let mut rows: Vec<(usize, usize)> = fit.groups[0].iter().enumerate().flat_map(of_group).collect();
+    let mut rows: Vec<(usize, usize)> = Vec::new();
+    for unknown in &fit.unknowns {
+        if let Kind::Strength(group) = unknown.kind {
+            rows.extend(fit.groups[0][group].iter().map(|&row| (row, group)));
+        }
+    }
     rows.sort_unstable();
     rows
 }
@@ -260,6 +279,10 @@ impl fmt::Display for MatrixFit {
             column.set_cell_alignment(CellAlignment::Right);
         }
         writeln!(f, "{vars}")?;
+        for Other { elements, mean, sigma, .. } in self.other.iter().filter(|one| !one.elements.is_empty()) {
+            let line = format!("gradient added to {}: {mean:+.5} ± {sigma:.5} 1/m^2", elements.join(", "));
+            writeln!(f, "{}", fill(&line))?;
+        }
         if let Some(tunes) = &self.tunes {
             writeln!(f, "tunes {:.4} {:.4}", tunes.x, tunes.y)?;
         }
@@ -320,8 +343,7 @@ pub struct OtherChange {
 impl OtherChange {
     /// Of anything that is no cable.
     pub fn of(one: &measured::compare::Other) -> Self {
-        let unit = if one.is_share { "" } else { "1/m" };
-        Self { kind: one.word, at: one.at.clone(), change: Some(one.change), sigma: Some(one.sigma), unit }
+        Self { kind: one.word, at: one.at.clone(), change: Some(one.change), sigma: Some(one.sigma), unit: one.unit }
     }
 
     /// Of a cable.

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use serde::Deserialize;
-use twin::{EffectText, Ring};
+use twin::{EffectText, Kind, Ring};
 
 use twin::unreadable;
 
@@ -15,8 +15,10 @@ const DECISIVE: f64 = 0.95;
 pub struct Calibration {
     /// The recording.
     pub recording: String,
-    /// Names and factors of the params that were fitted.
+    /// Names and factors of the params that were fitted, and of dipoles with a gradient.
     pub strengths: Vec<(String, f64)>,
+    /// Gradients [1/m^2] that are added to magnets by their names.
+    pub added: Vec<(String, f64)>,
     /// Tunes at the recording's mean supply currents, if they are known.
     pub tunes: Option<[f64; 2]>,
     /// What was found beyond them, with its sentence.
@@ -89,6 +91,8 @@ struct ResultFile {
     recording: serde_json::Value,
     vars: Option<Vec<Var>>,
     vars_after: Option<Vec<Var>>,
+    #[serde(default)]
+    other: Vec<Other>,
     tunes: Option<Tunes>,
     #[serde(default)]
     findings: Vec<Finding>,
@@ -103,6 +107,14 @@ struct Tunes {
 #[derive(Deserialize)]
 struct Var {
     name: String,
+    mean: f64,
+}
+
+/// What a measured matrix said beside the strengths; a gradient that is added names its magnets.
+#[derive(Deserialize)]
+struct Other {
+    #[serde(default)]
+    elements: Vec<String>,
     mean: f64,
 }
 
@@ -149,20 +161,50 @@ impl Calibration {
             }
         }
         let strengths = vars.into_iter().map(|var| (var.name, var.mean)).collect();
+        let of_magnets = |one: Other| one.elements.into_iter().map(move |name| (name, one.mean));
+        let added = file.other.into_iter().flat_map(of_magnets).collect();
         let tunes = file.tunes.map(|tunes| [tunes.x, tunes.y]);
-        Ok(Self { recording: recordings(&file.recording), strengths, tunes, findings, open })
+        Ok(Self { recording: recordings(&file.recording), strengths, added, tunes, findings, open })
     }
 
-    /// The factors in the order of the ring's params.
+    /// The ring with the strengths that were found.
     ///
     /// # Errors
     /// [`CalibrationError::Name`], [`CalibrationError::Missing`]: the result of another ring.
-    pub fn vars(&self, ring: &Ring, path: &Path) -> Result<Vec<f64>, CalibrationError> {
-        let (path, machine) = (path.display().to_string(), ring.name.clone());
-        let names = ring.var_names();
-        if let Some((name, _)) = self.strengths.iter().find(|(name, _)| !names.contains(name)) {
-            return Err(CalibrationError::Name { path, name: name.clone(), machine });
+    pub fn strengthened(&self, ring: &Ring, path: &Path) -> Result<Ring, CalibrationError> {
+        let mut found = ring.with_vars(&self.vars(ring, path)?);
+        for (name, factor) in &self.strengths {
+            // that of a quadrupole is one of its param
+            if let Some(gradient @ (_, true)) = gradient_of(&mut found, name) {
+                *gradient.0 *= factor;
+            }
         }
+        for (name, added) in &self.added {
+            match gradient_of(&mut found, name) {
+                Some((gradient, _)) => *gradient += added,
+                None => return Err(self.no_var(name, ring, path)),
+            }
+        }
+        Ok(found)
+    }
+
+    fn no_var(&self, name: &str, ring: &Ring, path: &Path) -> CalibrationError {
+        let (path, machine) = (path.display().to_string(), ring.name.clone());
+        CalibrationError::Name { path, name: name.into(), machine }
+    }
+
+    /// The factors in the order of the ring's params.
+    fn vars(&self, ring: &Ring, path: &Path) -> Result<Vec<f64>, CalibrationError> {
+        let names = ring.var_names();
+        let is_dipole = |name: &str| {
+            let is_it = |one: &twin::Element| one.name == name && matches!(one.kind, Kind::Bend(_));
+            ring.elements.iter().any(is_it)
+        };
+        let is_unknown = |name: &str| !names.iter().any(|own| own == name) && !is_dipole(name);
+        if let Some((name, _)) = self.strengths.iter().find(|(name, _)| is_unknown(name)) {
+            return Err(self.no_var(name, ring, path));
+        }
+        let (path, machine) = (path.display().to_string(), ring.name.clone());
         let mean = |name: &String| self.strengths.iter().find(|(own, _)| own == name).map(|(_, mean)| *mean);
         let missing = |name: &String| CalibrationError::Missing {
             path: path.clone(),
@@ -171,6 +213,16 @@ impl Calibration {
         };
         names.iter().map(|name| mean(name).ok_or_else(|| missing(name))).collect()
     }
+}
+
+/// Gradient [1/m^2] of a magnet of some name, and whether it is a dipole's.
+fn gradient_of<'r>(ring: &'r mut Ring, name: &str) -> Option<(&'r mut f64, bool)> {
+    let mut named = ring.elements.iter_mut().filter(|one| one.name == name);
+    named.find_map(|one| match &mut one.kind {
+        Kind::Quadrupole { k1 } => Some((k1, false)),
+        Kind::Bend(bend) => Some((&mut bend.k1, true)),
+        _ => None,
+    })
 }
 
 impl Finding {
@@ -220,7 +272,7 @@ mod tests {
     #[test]
     fn what_is_no_result_of_this_ring_says_what_disagrees() {
         let message = |text: &str| {
-            let result = parse(text).and_then(|r| r.vars(&Ring::booster(), Path::new("fit.json")));
+            let result = parse(text).and_then(|r| r.strengthened(&Ring::booster(), Path::new("fit.json")));
             result.unwrap_err().to_string()
         };
         assert_eq!(
@@ -240,5 +292,24 @@ mod tests {
             "fit.json: var A2: expected a mean above 0, found -1"
         );
         assert!(message("{").starts_with("fit.json: EOF while parsing"));
+    }
+
+    /// A factor of a dipole's gradient, and gradients that are added to a dipole and to a magnet without one.
+    #[test]
+    fn gradients_of_dipoles_and_added_ones_are_those_of_the_ring() {
+        let ring = r#"{"name": "ring", "circumference_m": 6, "k1": {}, "reference": {"particle": "proton", "kinetic_energy_GeV": 1},
+            "elements": [{"name": "Q.0", "type": "quadrupole", "s_start": 0, "length": 1, "k1": 2},
+                         {"name": "Q.1", "type": "quadrupole", "s_start": 1, "length": 1, "k1": 0, "fit": false},
+                         {"name": "B.2", "type": "sbend", "s_start": 2, "length": 1, "angle": 0.1, "k1": -0.5},
+                         {"name": "B.3", "type": "sbend", "s_start": 3, "length": 1, "angle": 0.1, "k1": 0}]}"#;
+        let ring = Ring::parse(ring, "ring.json").unwrap();
+        let result = parse(
+            r#"{"vars": [{"name": "Q.0", "mean": 1.01}, {"name": "B.2", "mean": 0.98}],
+                "other": [{"kind": "bpm_gain", "at": "x_M.0", "mean": 1.1, "sigma": 0.1},
+                          {"kind": "added_gradient", "at": "Q.1", "elements": ["Q.1", "B.3"], "mean": 0.004, "sigma": 0.001}]}"#,
+        );
+        let mut found = result.unwrap().strengthened(&ring, Path::new("fit.json")).unwrap();
+        let gradients = ["Q.0", "Q.1", "B.2", "B.3"].map(|name| *gradient_of(&mut found, name).unwrap().0);
+        assert_eq!(gradients, [2.02, 0.004, -0.49, 0.004]);
     }
 }

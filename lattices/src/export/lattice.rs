@@ -91,7 +91,7 @@ impl Lattice {
     pub fn of(ring: &Ring, result: &Calibration, path: &Path) -> Result<Self, ExportError> {
         let effects: Result<Vec<Effect>, _> = result.findings.iter().map(|(text, _)| text.resolve(ring)).collect();
         let effects = effects?;
-        let machine = Machine::new(ring.with_vars(&result.vars(ring, path)?), Rf::FixedMomentum, &effects)?;
+        let machine = Machine::new(result.strengthened(ring, path)?, Rf::FixedMomentum, &effects)?;
         let mut lattice = Self::plain(machine.ring());
         let version = env!("CARGO_PKG_VERSION");
         lattice.remarks.insert(0, format!("{}: strengths from {}, by orbitcal {version}", ring.name, result.recording));

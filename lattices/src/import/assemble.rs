@@ -1,7 +1,7 @@
 //! A lattice, its instruments and a table as one measurement.
 //!
-//! A monitor or corrector with a length acts in its middle: a monitor, and a corrector within the field of a magnet, cut their element in two with a row of no
-//! length between the halves.
+//! A monitor with a length reads in its middle, and a corrector kicks all along its length. A monitor, and a corrector within the field of a magnet, cut their
+//! element in two with a row of no length between the halves.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -36,7 +36,7 @@ pub fn assemble(
     measured: &Measurement,
 ) -> Result<Folder, MeasuredError> {
     let Measurement { matrix, dispersion, order, conventions } = measured;
-    let names = names(lattice);
+    let names = names(lattice, &instruments.called);
     let lines = matrix.lines(&instruments.monitors, &names, *order)?;
     let columns = matrix.columns(&instruments.correctors, &names, *order)?;
     let kicks = conventions.kick.of("--kick", &columns, &instruments.correctors, &names)?;

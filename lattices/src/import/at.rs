@@ -74,11 +74,13 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
         name: fields.name.into(),
         kind: class.into(),
         length: fields.number("Length")?,
+        words: fields.words(),
         ..Element::default()
     };
     one.role = match class {
         "Monitor" => Role::Monitor([true; 2]),
         "Corrector" => Role::Corrector([true; 2]),
+        "RingParam" => Role::Ring,
         _ => Role::Other,
     };
     if class == "RFCavity" {

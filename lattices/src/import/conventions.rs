@@ -4,7 +4,7 @@ use std::path::Path;
 
 use twin::Plane;
 
-use super::instruments::{Channel, Instrument, label};
+use super::instruments::{Channel, Instrument, Order, label};
 use super::table::Table;
 use measured::MeasuredError;
 
@@ -126,6 +126,19 @@ pub struct Conventions {
     pub signs: Signs,
     /// Standard deviation of an element of the matrix, in its own unit.
     pub noise: PerInstrument,
+}
+
+/// What a file says of its own matrix.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Stated {
+    /// Unit of the orbit.
+    pub unit: Option<OrbitUnit>,
+    /// Deflection that an element belongs to [mrad].
+    pub kick: Option<f64>,
+    /// Which change that is.
+    pub kick_is: Option<KickIs>,
+    /// Order of lines and columns, which have no names.
+    pub order: Option<Order>,
 }
 
 impl Conventions {

@@ -1,11 +1,14 @@
 //! The elements of a lattice file, whatever its format: what a ring needs to first order, and what was left out.
 
+use core::f64::consts::TAU;
 use core::fmt;
 use std::collections::BTreeMap;
 
 use measured::MeasuredError;
 use measured::folder::Particle;
 
+/// Angles of dipoles in files are rounded, and are those of measured fields; all of them make a turn within this share.
+const ROUNDING: f64 = 0.01;
 /// Speed of light [m/s].
 const LIGHT: f64 = 299_792_458.0;
 
@@ -85,6 +88,8 @@ pub struct Element {
     pub k2: f64,
     /// What the type says that it measures or sets.
     pub role: Role,
+    /// Fields of the file that are text, by which an instrument can be chosen.
+    pub words: BTreeMap<String, String>,
 }
 
 impl Element {
@@ -105,6 +110,8 @@ pub enum Role {
     Monitor([bool; 2]),
     /// A corrector in x, in y.
     Corrector([bool; 2]),
+    /// Properties of the ring, which stand among its elements: never an instrument.
+    Ring,
 }
 
 impl Lattice {
@@ -125,6 +132,27 @@ impl Lattice {
     /// Circumference [m].
     pub fn circumference(&self) -> f64 {
         self.elements.iter().map(|one| one.length).sum()
+    }
+
+    /// The dipoles bend by a full turn.
+    ///
+    /// # Errors
+    /// [`MeasuredError::Table`]: the file holds one period of a ring, or no ring, with the angle that was found.
+    pub fn expect_ring(&self) -> Result<(), MeasuredError> {
+        let turns = self.elements.iter().map(|one| one.bend).sum::<f64>().abs() / TAU;
+        let is_whole = |turns: f64| (turns - 1.0).abs() < ROUNDING;
+        if is_whole(turns) {
+            return Ok(());
+        }
+        let periods = turns.recip().round();
+        let hint = match (is_whole(turns * periods), self.format) {
+            (false, _) => String::new(),
+            (true, Format::At | Format::AtMat) => {
+                format!("; it looks like one of {periods} periods: state the periodicity, or write all of the ring")
+            }
+            (true, _) => format!("; it looks like one of {periods} periods: write all of the ring"),
+        };
+        self.refuse(format!("the dipoles bend by {:.4} degrees, expected the 360 of a ring{hint}", 360.0 * turns))
     }
 
     /// RF frequency [Hz]: as stated, or by the harmonic number and the speed of the particle.

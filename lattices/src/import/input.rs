@@ -22,7 +22,7 @@ impl Input {
     /// Read a file of any format; `lacking` is what a LOCO file may not state.
     ///
     /// # Errors
-    /// [`MeasuredError`].
+    /// [`MeasuredError`]; [`Lattice::expect_ring`].
     pub fn read(path: &Path, lacking: &Lacking) -> Result<Self, MeasuredError> {
         let Source { path: file, name } = Source::of(path);
         let words = file.display().to_string();
@@ -30,9 +30,13 @@ impl Input {
         if name.is_none() && MatFile::is_one(&bytes) {
             let file = MatFile::of(&words, bytes)?;
             if loco::is_one(&file) {
-                return Ok(Self::Loco(Box::new(loco::read(&file, lacking)?)));
+                let loco = loco::read(&file, lacking)?;
+                loco.lattice.expect_ring()?;
+                return Ok(Self::Loco(Box::new(loco)));
             }
         }
-        Lattice::read(path).map(Self::Lattice)
+        let lattice = Lattice::read(path)?;
+        lattice.expect_ring()?;
+        Ok(Self::Lattice(lattice))
     }
 }

@@ -1,9 +1,9 @@
 //! Monitors and correctors of a lattice, and the names by which a table may call them.
 //!
 //! An element of a name that others have too is called by its number among them, as MAD-X does: `BPM[3]` is the third. A table says the plane in front
-//! of the name, `x:BPM[3]`, where the element has both.
+//! of the name, `x:BPM[3]`, where the element has both. An instrument that is chosen by another field of the file is called by that.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use twin::Plane;
 
@@ -27,6 +27,8 @@ pub struct Instruments {
     pub monitors: Vec<Instrument>,
     /// Correctors.
     pub correctors: Vec<Instrument>,
+    /// Names of elements that were chosen by another field.
+    pub called: BTreeMap<usize, String>,
 }
 
 /// What is looked for.
@@ -57,32 +59,36 @@ impl Instruments {
     /// # Errors
     /// [`MeasuredError::Table`]: none were found, with the types of elements that were.
     pub fn choose(lattice: &Lattice, monitors: &[Pattern], correctors: &[Pattern]) -> Result<Self, MeasuredError> {
+        let called = lattice.elements.iter().enumerate().filter_map(|(element, one)| {
+            let name = monitors.iter().chain(correctors).find_map(|pattern| pattern.name(one))?;
+            (name != one.name).then(|| (element, name.to_owned()))
+        });
         Ok(Self {
             monitors: chosen(lattice, monitors, MONITORS)?,
             correctors: chosen(lattice, correctors, CORRECTORS)?,
+            called: called.collect(),
         })
     }
 
     /// Names of the monitors in a table, all of x before all of y.
     pub fn monitor_names(&self, lattice: &Lattice) -> Vec<String> {
-        labels(&self.monitors, lattice)
+        labels(&self.monitors, &names(lattice, &self.called))
     }
 
     /// The same of the correctors.
     pub fn corrector_names(&self, lattice: &Lattice) -> Vec<String> {
-        labels(&self.correctors, lattice)
+        labels(&self.correctors, &names(lattice, &self.called))
     }
 }
 
-fn labels(of: &[Instrument], lattice: &Lattice) -> Vec<String> {
-    let names = names(lattice);
-    in_order(of, Order::Planes).into_iter().map(|channel| label(channel, &names)).collect()
+fn labels(of: &[Instrument], names: &[String]) -> Vec<String> {
+    in_order(of, Order::Planes).into_iter().map(|channel| label(channel, names)).collect()
 }
 
 fn chosen(lattice: &Lattice, patterns: &[Pattern], sought: Sought) -> Result<Vec<Instrument>, MeasuredError> {
-    let names = || lattice.elements.iter().map(|one| one.name.as_str());
-    if let Some(idle) = patterns.iter().find(|one| names().all(|name| one.planes(name, None).is_none())) {
-        let some: Vec<&str> = names().take(12).collect();
+    let elements = || lattice.elements.iter().enumerate().filter(|(_, one)| one.role != Role::Ring);
+    if let Some(idle) = patterns.iter().find(|pattern| elements().all(|(_, one)| pattern.name(one).is_none())) {
+        let some: Vec<&str> = elements().map(|(_, one)| one.name.as_str()).take(12).collect();
         return lattice.refuse(format!(
             "{} {}: no element has such a name; the first are {}",
             sought.option,
@@ -90,11 +96,11 @@ fn chosen(lattice: &Lattice, patterns: &[Pattern], sought: Sought) -> Result<Vec
             some.join(", ")
         ));
     }
-    let found = lattice.elements.iter().enumerate().filter_map(|(element, one)| {
+    let found = elements().filter_map(|(element, one)| {
         let of_type = (sought.planes)(one.role);
         let planes = match patterns {
             [] => of_type?,
-            _ => joined(patterns.iter().filter_map(|pattern| pattern.planes(&one.name, of_type)))?,
+            _ => joined(patterns.iter().filter_map(|pattern| pattern.name(one).map(|_| pattern.planes(of_type))))?,
         };
         Some(Instrument { element, planes })
     });
@@ -142,24 +148,23 @@ pub(super) fn in_order(of: &[Instrument], order: Order) -> Vec<Channel> {
     all
 }
 
-/// Names of the elements: as they are where they are unique, else with their number among those of the name.
-pub(super) fn names(lattice: &Lattice) -> Vec<String> {
+/// Names of the elements, some of which are called by another one: as they are where they are unique, else with their number among those of the name.
+pub(super) fn names(lattice: &Lattice, called: &BTreeMap<usize, String>) -> Vec<String> {
+    let names = lattice.elements.iter().enumerate().map(|(element, one)| called.get(&element).unwrap_or(&one.name));
     let mut totals: HashMap<&str, usize> = HashMap::new();
-    lattice.elements.iter().for_each(|one| *totals.entry(one.name.as_str()).or_default() += 1);
+    names.clone().for_each(|name| *totals.entry(name).or_default() += 1);
     let mut seen: HashMap<&str, usize> = HashMap::new();
-    let numbered = lattice.elements.iter().map(|one| {
-        let number = seen.entry(one.name.as_str()).or_default();
+    let numbered = names.map(|name| {
+        let number = seen.entry(name).or_default();
         *number += 1;
-        if totals[one.name.as_str()] == 1 { one.name.clone() } else { format!("{}[{number}]", one.name) }
+        if totals[name.as_str()] == 1 { name.clone() } else { format!("{name}[{number}]") }
     });
     numbered.collect()
 }
 
 /// Names of monitors and of correctors in a table, in the order in which the ring of the lattice has them.
 pub fn table_names(lattice: &Lattice, instruments: &Instruments) -> [Vec<String>; 2] {
-    let names = names(lattice);
-    [&instruments.monitors, &instruments.correctors]
-        .map(|all| in_order(all, Order::Planes).into_iter().map(|channel| label(channel, &names)).collect())
+    [instruments.monitor_names(lattice), instruments.corrector_names(lattice)]
 }
 
 /// Name of a channel in a table: `x:BPM[3]`.

@@ -18,6 +18,7 @@ mod instruments;
 mod loco;
 mod madx;
 mod mat;
+mod mml;
 mod pals;
 mod pattern;
 mod read;
@@ -28,7 +29,7 @@ mod xsuite;
 
 pub use agreement::{Agreement, agreement};
 pub use assemble::{Measurement, assemble, bare};
-pub use conventions::{Conventions, KickIs, Missing, OrbitUnit, PerInstrument, Signs};
+pub use conventions::{Conventions, KickIs, Missing, OrbitUnit, PerInstrument, Signs, Stated};
 pub use element::{Element, Format, Lattice, Role};
 pub use input::Input;
 pub use instruments::{Instrument, Instruments, Order, table_names};

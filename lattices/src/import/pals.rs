@@ -11,7 +11,7 @@ use std::collections::HashMap;
 use serde_json::Value;
 
 use super::element::{Element, Format, Lattice, Role};
-use super::fields::{Fields, NONE, Strengths, give};
+use super::fields::{DISPLACED, Fields, NONE, Strengths, give};
 use measured::MeasuredError;
 use measured::folder::Particle;
 
@@ -127,6 +127,9 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
         "Solenoid" if fields.group("SolenoidP").number("Ksol")? == 0.0 => {}
         _ if FIELD_FREE.contains(&kind) => {}
         _ => return Err(fields.wrong(format!("kind {kind} acts on the orbit and is not known here"))),
+    }
+    if fields.group("BodyShiftP").any(&["x_offset", "y_offset", "z_offset", "x_rot", "y_rot"])? {
+        lattice.leave_out(DISPLACED);
     }
     let strengths = strengths(fields, one.length)?;
     give(lattice, one, strengths)

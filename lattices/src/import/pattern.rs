@@ -1,13 +1,17 @@
-//! Names by patterns: `BPM*`, or `x:BPM*` where they are of one plane.
+//! Names by patterns: `BPM*`, or `x:BPM*` where they are of one plane; `CommonName=PH*`, or `x:CommonName=PH*`, by another field of the file.
 
 use core::str::FromStr;
 
 use glob::MatchOptions;
 
+use super::element::Element;
+
 /// A pattern of names, and the plane if it states one.
 #[derive(Debug, Clone)]
 pub struct Pattern {
     text: String,
+    /// Where the names stand; none of the names of the elements.
+    field: Option<String>,
     names: glob::Pattern,
     planes: Option<[bool; 2]>,
 }
@@ -21,8 +25,9 @@ impl FromStr for Pattern {
             Some(("y:", names)) => (Some([false, true]), names),
             _ => (None, text),
         };
+        let (field, names) = names.split_once('=').map_or((None, names), |(field, names)| (Some(field.into()), names));
         let names = glob::Pattern::new(names).map_err(|error| error.to_string())?;
-        Ok(Self { text: text.into(), names, planes })
+        Ok(Self { text: text.into(), field, names, planes })
     }
 }
 
@@ -32,9 +37,15 @@ impl Pattern {
         &self.text
     }
 
-    /// The planes of a name that matches, whatever its case: those of the pattern, else those that the type of the element has.
-    pub(super) fn planes(&self, name: &str, of_type: Option<[bool; 2]>) -> Option<[bool; 2]> {
+    /// The name of an element that matches, whatever its case.
+    pub(super) fn name<'e>(&self, element: &'e Element) -> Option<&'e str> {
         let options = MatchOptions { case_sensitive: false, ..MatchOptions::new() };
-        self.names.matches_with(name, options).then(|| self.planes.or(of_type).unwrap_or([true; 2]))
+        let name = self.field.as_ref().map_or(Some(&element.name), |field| element.words.get(field))?;
+        self.names.matches_with(name, options).then_some(name)
+    }
+
+    /// The planes of an element that matches: those of the pattern, else those that its type has.
+    pub(super) fn planes(&self, of_type: Option<[bool; 2]>) -> [bool; 2] {
+        self.planes.or(of_type).unwrap_or([true; 2])
     }
 }

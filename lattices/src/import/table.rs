@@ -1,11 +1,13 @@
 //! A plain table of numbers: separated by commas, semicolons, tabs or spaces, with names in the first line and in the first column or without; or a
 //! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
+//! A response matrix of the Matlab Middle Layer needs no `NAME`.
 
 use std::fs;
 use std::path::Path;
 
+use super::conventions::Stated;
 use super::hdf5::{self, Matrix};
-use super::instruments::{Channel, Instrument, Order, channel, in_order};
+use super::instruments::{Channel, Instrument, Order, channel, in_order, label};
 use super::mat::MatFile;
 use super::source::Source;
 use measured::MeasuredError;
@@ -15,6 +17,8 @@ use measured::MeasuredError;
 pub struct Table {
     /// Name of the file.
     pub file: String,
+    /// What the file says of its numbers.
+    pub stated: Stated,
     columns: Option<Vec<String>>,
     rows: Vec<Line>,
 }
@@ -37,10 +41,11 @@ impl Table {
         let file = source.path.display().to_string();
         let bytes = fs::read(&source.path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
         if MatFile::is_one(&bytes) {
-            return Self::of(path, MatFile::of(&file, bytes)?.matrix(source.name.as_deref())?);
+            let (matrix, stated) = MatFile::of(&file, bytes)?.matrix(source.name.as_deref())?;
+            return Self::of(path, matrix, stated);
         }
         if hdf5::is_one(&bytes) {
-            return Self::of(path, hdf5::matrix(&source, bytes)?);
+            return Self::of(path, hdf5::matrix(&source, bytes)?, Stated::default());
         }
         match String::from_utf8(bytes) {
             Ok(text) => Self::parse(&file, &text),
@@ -51,10 +56,10 @@ impl Table {
     }
 
     /// Numbers alone.
-    fn of(path: &Path, Matrix { width, values }: Matrix) -> Result<Self, MeasuredError> {
+    fn of(path: &Path, Matrix { width, values }: Matrix, stated: Stated) -> Result<Self, MeasuredError> {
         let lines = values.chunks(width.max(1)).enumerate();
         let rows = lines.map(|(at, values)| Line { number: at + 1, name: None, values: values.to_vec() }).collect();
-        let mut table = Self { file: path.display().to_string(), columns: None, rows };
+        let mut table = Self { file: path.display().to_string(), stated, columns: None, rows };
         table.check()?;
         match values.iter().position(|one| one.is_infinite()) {
             Some(at) => table.refuse(format!("line {}: expected a number, found {}", at / width + 1, values[at])),
@@ -67,7 +72,7 @@ impl Table {
     /// # Errors
     /// As [`Table::read`].
     pub fn parse(file: &str, text: &str) -> Result<Self, MeasuredError> {
-        let mut table = Self { file: file.into(), columns: None, rows: Vec::new() };
+        let mut table = Self { file: file.into(), stated: Stated::default(), columns: None, rows: Vec::new() };
         for (number, cells) in cells(file, text)? {
             let is_head = table.rows.is_empty() && table.columns.is_none();
             if is_head && cells.iter().skip(1).any(|cell| !is_number(cell)) {
@@ -164,7 +169,7 @@ impl Table {
         names: &[String],
         order: Option<Order>,
     ) -> Result<Vec<Channel>, MeasuredError> {
-        let channels = match (own, order) {
+        let channels = match (own, order.or(self.stated.order)) {
             (Some(own), _) => {
                 let found = own.iter().map(|name| channel(name, of, names)).collect::<Result<Vec<_>, _>>();
                 found.or_else(|problem| self.refuse(format!("{what}: {problem}")))?
@@ -181,7 +186,7 @@ impl Table {
         }
         let twice = channels.iter().enumerate().find(|(place, one)| channels[..*place].contains(one));
         match twice {
-            Some((place, _)) => self.refuse(format!("{what}: number {} stands there twice", place + 1)),
+            Some((_, twice)) => self.refuse(format!("{what}: {} stands there twice", label(*twice, names))),
             None => Ok(channels),
         }
     }
@@ -205,18 +210,21 @@ fn is_number(cell: &str) -> bool {
     cell.is_empty() || cell.parse::<f64>().is_ok()
 }
 
-/// Cells of each line that has some, with the number of the line; `#` begins a comment.
+/// Cells of each line that has some, with the number of the line; `#` begins a comment, whatever stands in it.
 fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredError> {
+    let is_comment = |line: &str| line.trim_start().starts_with('#');
+    let text: String =
+        text.lines().map(|line| if is_comment(line) { "\n".into() } else { format!("{line}\n") }).collect();
     let Some(delimiter) = [',', ';', '\t'].into_iter().find(|one| text.contains(*one)) else {
-        let lines = text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with('#'));
-        let words =
-            lines.map(|(number, line)| (number + 1, line.split_whitespace().map(str::to_owned).collect::<Vec<_>>()));
+        let words = text
+            .lines()
+            .enumerate()
+            .map(|(number, line)| (number + 1, line.split_whitespace().map(str::to_owned).collect::<Vec<_>>()));
         return Ok(words.filter(|(_, words)| !words.is_empty()).collect());
     };
     let mut reader = csv::ReaderBuilder::new()
         .has_headers(false)
         .flexible(true)
-        .comment(Some(b'#'))
         .trim(csv::Trim::All)
         .delimiter(delimiter as u8)
         .from_reader(text.as_bytes());

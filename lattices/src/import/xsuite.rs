@@ -73,7 +73,7 @@ fn reference(lattice: &mut Lattice, value: &Value) -> Result<(), MeasuredError> 
 
 fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> {
     let class = class(fields.value);
-    if fields.number("shift_x")? != 0.0 || fields.number("shift_y")? != 0.0 {
+    if fields.any(&["shift_x", "shift_y", "shift_s", "rot_x_rad", "rot_y_rad"])? {
         lattice.leave_out(DISPLACED);
     }
     let mut one = Element {
@@ -187,5 +187,11 @@ fn strengths(fields: &Fields, length: f64) -> Result<Strengths, MeasuredError> {
     let is_higher = fields.has_from("knl", 3) || fields.has_from("ksl", 3) || of(3)? != [0.0; 2];
     let dipole = [fields.at("knl", 0)?, fields.at("ksl", 0)?, fields.number("k0s")?];
     let is_dipole = dipole.iter().any(|field| field.abs() > NONE);
-    Ok(Strengths { k1: of(1)?, k2: of(2)?, is_dipole, is_higher, tilt: fields.number("rot_s_rad")? })
+    Ok(Strengths {
+        k1: of(1)?,
+        k2: of(2)?,
+        is_dipole,
+        is_higher,
+        tilt: fields.number("rot_s_rad")? + fields.number("rot_s_rad_no_frame")?,
+    })
 }

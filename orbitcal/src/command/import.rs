@@ -50,26 +50,31 @@ fn of_lattice(options: &Import, lattice: &Lattice) -> Result<Imported, CommandEr
 /// A file that states everything.
 fn of_loco(options: &Import, loco: Loco) -> Result<Imported, CommandError> {
     let Loco { lattice, instruments, folder } = loco;
-    let stated = [
-        ("--matrix", options.matrix.is_some()),
-        ("--monitors", !options.monitors.is_empty()),
-        ("--correctors", !options.correctors.is_empty()),
-        ("--orbit-unit", options.orbit_unit.is_some()),
-        ("--kick-is", options.kick_is.is_some()),
-        ("--kick-sign", options.kick_sign.is_some()),
-        ("--noise", options.noise.is_some()),
-        ("--order", options.order.is_some()),
-    ];
-    if let Some((option, _)) = stated.iter().find(|(_, is_given)| *is_given) {
-        return Err(CommandError::Input(format!(
-            "{} is a LOCO file, which states it; leave {option} out",
-            lattice.file
-        )));
-    }
+    expect_unstated(
+        &format!("{} is a LOCO file, which states it", lattice.file),
+        &[
+            ("--matrix", options.matrix.is_some()),
+            ("--monitors", !options.monitors.is_empty()),
+            ("--correctors", !options.correctors.is_empty()),
+            ("--orbit-unit", options.orbit_unit.is_some()),
+            ("--kick-is", options.kick_is.is_some()),
+            ("--kick-sign", options.kick_sign.is_some()),
+            ("--noise", options.noise.is_some()),
+            ("--order", options.order.is_some()),
+        ],
+    )?;
     let result = Imported::of(&lattice, &instruments, tunes(&folder)?);
     match &options.out {
         Some(out) => made(options, &Folder { name: name(out)?, ..folder }, out, result),
         None => Ok(result.with_agreement(&agreement(&folder, rf(options))?)),
+    }
+}
+
+/// None of some options is given, for a reason.
+fn expect_unstated(reason: &str, options: &[(&str, bool)]) -> Result<(), CommandError> {
+    match options.iter().find(|(_, is_given)| *is_given) {
+        Some((option, _)) => Err(CommandError::Input(format!("{reason}; leave {option} out"))),
+        None => Ok(()),
     }
 }
 
@@ -109,10 +114,11 @@ fn measurement(
     out: &Path,
 ) -> Result<Folder, CommandError> {
     let name = name(out)?;
-    let conventions = conventions(options)?;
+    let matrix = Table::read(matrix)?;
+    let conventions = conventions(options, &matrix)?;
     let dispersion = options.dispersion.as_deref().map(Table::read).transpose()?;
     let measured = Measurement {
-        matrix: &Table::read(matrix)?,
+        matrix: &matrix,
         dispersion: dispersion.as_ref().zip(options.rf_step),
         order: options.order.map(Into::into),
         conventions: &conventions,
@@ -120,29 +126,37 @@ fn measurement(
     Ok(Folder { name, ..assemble(lattice, instruments, options.rf_frequency, &measured)? })
 }
 
-/// All of them, or everything that is missing.
-fn conventions(options: &Import) -> Result<Conventions, CommandError> {
+/// All of them, by the file or by the options, or everything that is missing.
+fn conventions(options: &Import, matrix: &Table) -> Result<Conventions, CommandError> {
+    let stated = &matrix.stated;
+    expect_unstated(
+        &format!("{} states it", matrix.file),
+        &[
+            ("--orbit-unit", options.orbit_unit.is_some() && stated.unit.is_some()),
+            ("--kick", options.kick.is_some() && stated.kick.is_some()),
+            ("--kick-is", options.kick_is.is_some() && stated.kick_is.is_some()),
+            ("--order", options.order.is_some() && stated.order.is_some()),
+        ],
+    )?;
+    let unit = options.orbit_unit.map(Into::into).or(stated.unit);
+    let kick = kick(options)?.or(stated.kick.map(PerInstrument::All));
+    let kick_is = options.kick_is.map(Into::into).or(stated.kick_is);
+    let asked = [
+        (unit.is_none(), Missing::Unit),
+        (kick.is_none(), Missing::Kick),
+        (kick_is.is_none(), Missing::KickIs),
+        (options.kick_sign.is_none(), Missing::Signs),
+        (options.noise.is_none(), Missing::Noise),
+    ];
     let (Some(unit), Some(kick), Some(kick_is), Some(signs), Some(noise)) =
-        (options.orbit_unit, kick(options)?, options.kick_is, options.kick_sign, &options.noise)
+        (unit, kick, kick_is, options.kick_sign, &options.noise)
     else {
-        let asked = [
-            (options.orbit_unit.is_none(), Missing::Unit),
-            (options.kick.is_none(), Missing::Kick),
-            (options.kick_is.is_none(), Missing::KickIs),
-            (options.kick_sign.is_none(), Missing::Signs),
-            (options.noise.is_none(), Missing::Noise),
-        ];
         let missing = asked.iter().filter(|(is_missing, _)| *is_missing).map(|(_, one)| format!("\n  {}", one.words()));
         return Err(CommandError::Input(format!(
             "the matrix does not say, and nothing is guessed:{}",
             missing.collect::<String>()
         )));
     };
-    Ok(Conventions {
-        unit: unit.into(),
-        kick,
-        kick_is: kick_is.into(),
-        signs: signs.into(),
-        noise: PerInstrument::parse("--noise", noise)?,
-    })
+    let noise = PerInstrument::parse("--noise", noise)?;
+    Ok(Conventions { unit, kick, kick_is, signs: signs.into(), noise })
 }

@@ -41,8 +41,8 @@ struct Field {
 }
 
 impl Parameter {
-    /// `K` of a gradient, `PolynomA` of a skew gradient; none for anything else.
-    fn word(&self) -> Option<&'static str> {
+    /// `K` of a gradient, `PolynomA` of a skew gradient; none for anything else, and for gradients in unlike ratios that start at 0 and lose them.
+    fn word(&self, start: f64) -> Option<&'static str> {
         let word = |one: &Field| match (one.name.as_str(), one.index) {
             ("K", 0) | ("PolynomB", 1) => Some("K"),
             ("PolynomA", 1) => Some("PolynomA"),
@@ -50,7 +50,8 @@ impl Parameter {
         };
         let first = word(self.fields.first()?)?;
         let is_like = |one: &Field| one.factor.is_some() && word(one) == Some(first);
-        self.fields.iter().all(is_like).then_some(first)
+        let are_alike = || self.fields.iter().all(|one| one.factor == self.fields[0].factor);
+        (self.fields.iter().all(is_like) && (start != 0.0 || are_alike())).then_some(first)
     }
 }
 
@@ -79,6 +80,13 @@ impl<'a> LocoFit<'a> {
         Ok(fit)
     }
 
+    /// True of an element whose gradient is a parameter.
+    pub fn has_gradient(&self, element: usize) -> bool {
+        let words = self.parameters.iter().zip(&self.values[0]).map(|(one, start)| (one, one.word(*start)));
+        let mut gradients = words.filter(|(_, word)| *word == Some("K")).map(|(one, _)| one);
+        gradients.any(|one| one.fields.iter().any(|field| field.element == element))
+    }
+
     /// The fit, for the folder; none where nothing was fitted.
     pub fn reference(
         &self,
@@ -87,8 +95,8 @@ impl<'a> LocoFit<'a> {
         lattice: &Lattice,
         places: &[usize],
     ) -> Result<Option<ReferenceFit>, MeasuredError> {
-        let kept: Vec<(usize, &'static str)> =
-            self.parameters.iter().enumerate().filter_map(|(at, one)| Some((at, one.word()?))).collect();
+        let words = self.parameters.iter().zip(&self.values[0]).map(|(one, start)| one.word(*start));
+        let kept: Vec<(usize, &'static str)> = words.enumerate().filter_map(|(at, word)| Some((at, word?))).collect();
         let (Some(flags), false) = (&self.flags, kept.is_empty()) else { return Ok(None) };
         // a magnet with a corrector in it was cut around a row of no length
         let of_element = |one: &Field| match places[one.element] {
@@ -160,7 +168,7 @@ fn general(number: f64) -> String {
 pub(super) fn start(fit: &LocoFit, document: &mut Value) -> Result<usize, MeasuredError> {
     let mut others = 0;
     for (one, value) in fit.parameters.iter().zip(&fit.values[0]) {
-        if one.word().is_none() {
+        if one.word(*value).is_none() {
             others += 1;
             continue;
         }

@@ -1,5 +1,7 @@
 //! Monitors and correctors of a LOCO file, in the order of the rows and columns of its matrix.
 
+use std::collections::BTreeMap;
+
 use twin::Plane;
 
 use super::{Lacking, Structs};
@@ -112,7 +114,9 @@ fn kicks(
     for (stated, columns) in stated.into_iter().zip([&columns[..x], &columns[x..]]) {
         match (stated, &lacking.kick) {
             (Some(stated), _) => all.extend(stated.many(columns.len(), "one a corrector of its plane")?),
-            (None, Some(kick)) => all.extend(kick.of("--kick", columns, &joined(columns), &names(lattice))?),
+            (None, Some(kick)) => {
+                all.extend(kick.of("--kick", columns, &joined(columns), &names(lattice, &BTreeMap::new()))?)
+            }
             (None, None) => {
                 return Err(correctors.wrong(
                     "no HCMKicks or no VCMKicks (LOCO would take 1 mrad); state with --kick MRAD by how much the kick of each corrector differs between the two orbits",

@@ -22,6 +22,8 @@ mod instruments;
 #[cfg(test)]
 mod tests;
 
+use std::collections::BTreeMap;
+
 use nalgebra::{DMatrix, DVector};
 
 use self::fit::{LocoFit, start};
@@ -91,7 +93,7 @@ pub(in crate::import) fn read(file: &MatFile, lacking: &Lacking) -> Result<Loco,
     let mut lattice = at_mat::lattice(&file.file, &document, Format::Loco)?;
     (0..not_applied).for_each(|_| {
         lattice
-            .leave_out("a parameter of LOCO's fit that is neither a gradient nor a skew gradient (it stays as fitted)")
+            .leave_out("a parameter of LOCO's fit that is neither a gradient nor a skew gradient, or one of magnets in unlike ratios that starts at 0 (it stays as fitted)")
     });
     if lattice.elements.len() != fit.length {
         return lattice.refuse(format!(
@@ -103,11 +105,12 @@ pub(in crate::import) fn read(file: &MatFile, lacking: &Lacking) -> Result<Loco,
     lattice.energy = energy(&structs.ring)?.or(lattice.energy);
     let lines = lines(&structs.monitors, lattice.elements.len())?;
     let columns = columns(&structs.correctors, lattice.elements.len())?;
-    let instruments = Instruments { monitors: joined(&lines), correctors: joined(&columns) };
+    let instruments = Instruments { monitors: joined(&lines), correctors: joined(&columns), called: BTreeMap::new() };
     starting_gains(&structs, &mut lattice)?;
     let rf = frequency(&structs, lacking, &mut lattice)?;
-    // a monitor of LOCO reads at the entrance of its element, where a row of the folder is read
-    let cut = Instruments { monitors: Vec::new(), correctors: instruments.correctors.clone() };
+    // a monitor of LOCO reads at the entrance of its element, where a row of the folder is read; a magnet that gets a gradient is cut as one that has it
+    let mut cut = Instruments { monitors: instruments.correctors.clone(), ..instruments.clone() };
+    cut.monitors.retain(|one| fit.has_gradient(one.element));
     let mut folder = empty(&lattice, &cut, rf)?;
     let places = places(&lattice, &cut);
     folder.matrix = matrix(&structs.measured.need("M")?, lines.len(), columns.len())?;

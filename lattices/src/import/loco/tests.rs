@@ -204,6 +204,23 @@ fn a_corrector_in_a_magnet_acts_in_its_middle_and_its_groups_follow() {
     assert_eq!((&groups[0].elements[..], &groups[1].elements[..]), (&[2, 4][..], &[12][..]));
 }
 
+/// LOCO adds to its values: one that starts at 0 is a gradient of its own, in a magnet with a corrector too.
+#[test]
+fn a_gradient_that_starts_at_nothing_keeps_its_magnets() {
+    let mut file = file();
+    numbers(&mut file, "FitParameters", 0, "Values")[0] = 0.0;
+    numbers(&mut file, "CMData", 0, "HCMIndex")[0] = 3.0;
+    let loco = read(&file).unwrap();
+    let (folder, groups) = (&loco.folder, loco.folder.meta.reference_fit.as_ref().unwrap());
+    assert_eq!((loco.lattice.elements[2].k1, &groups.fit_parameters[0].elements[..]), (0.0, &[2, 4][..]));
+    let all = measured::unknowns::groups(folder);
+    let unknowns = measured::unknowns::unknowns(folder, &all, true, &Default::default());
+    assert_eq!((unknowns[0].kind, unknowns[0].mean), (measured::Kind::Added(0), 0.0));
+    // 0.01 /m over half a magnet
+    assert!((unknowns[0].width - 0.01 / 0.15).abs() < 1e-12);
+    assert!(measured::lattice::ring(folder, &[], &[]).is_ok());
+}
+
 #[test]
 fn a_parameter_that_is_no_gradient_is_left_out_and_said() {
     let mut file = file();

@@ -6,7 +6,9 @@ mod place;
 
 pub(super) use place::Place;
 
+use super::conventions::Stated;
 use super::hdf5::Matrix;
+use super::mml;
 use measured::MeasuredError;
 
 /// Dimensions of an array; the first runs fastest.
@@ -85,19 +87,25 @@ impl MatFile {
         Some(Place::of(&self.file, name, value))
     }
 
-    /// The numbers of a variable as a matrix.
-    pub fn matrix(&self, name: Option<&str>) -> Result<Matrix, MeasuredError> {
+    /// The numbers of a variable as a matrix, and what the file says of them; without a name those of the only response matrix of the Matlab Middle Layer.
+    pub fn matrix(&self, name: Option<&str>) -> Result<(Matrix, Stated), MeasuredError> {
         let refuse = |problem: String| MeasuredError::Table { file: self.file.clone(), problem };
-        let Some(name) = name else {
+        let mut responses =
+            self.variables.iter().filter(|(_, value)| mml::is_one(value)).map(|(name, _)| name.as_str());
+        let only = responses.next().filter(|_| responses.next().is_none());
+        let Some(name) = name.or(only) else {
             return Err(refuse(format!("name a variable, {}:NAME; it has {}", self.file, self.words())));
         };
         let place =
             self.variable(name).ok_or_else(|| refuse(format!("no variable {name}; it has {}", self.words())))?;
+        if mml::is_one(place.value) {
+            return mml::read(&place);
+        }
         let (Some([lines, width]), values) = (place.shape(), place.numbers()?) else {
             return Err(place.expected("a matrix"));
         };
         let line = |line: usize| values.iter().skip(line).step_by(lines);
-        Ok(Matrix { width, values: (0..lines).flat_map(line).copied().collect() })
+        Ok((Matrix { width, values: (0..lines).flat_map(line).copied().collect() }, Stated::default()))
     }
 
     /// Names and kinds of the variables, for an error.
