@@ -336,7 +336,7 @@ fn a_dipole_of_xsuite_bends_by_its_field_as_its_reference_orbit_does() {
 fn a_replica_of_itself_is_refused() {
     let line = r#"{"element_names": ["a"], "elements": {"a": {"__class__": "Replica", "parent_name": "b"}, "b": {"__class__": "Replica", "parent_name": "a"}}}"#;
     let (_folder, path) = file("ring.json", line);
-    assert!(refused(&path).contains("element a of element_names, or what it replicates, is not among the elements"));
+    assert!(refused(&path).contains("element a, a replica: expected at most 64 levels within each other, found 65"));
 }
 
 /// As Tao writes: `L`, `pc_ref`, and a dipole's numbers among `ParticleP`.

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use measured::MeasuredError;
 use measured::folder::Particle;
+use twin::limits::ELEMENTS;
 
 /// Speed of light [m/s].
 const LIGHT: f64 = 299_792_458.0;
@@ -134,6 +135,15 @@ impl Lattice {
             Some(self.harmonic? * LIGHT * (1.0 - gamma.powi(-2)).sqrt() / self.circumference())
         };
         self.rf.or_else(by_harmonic)
+    }
+
+    /// Add an element.
+    pub(super) fn push(&mut self, one: Element) -> Result<(), MeasuredError> {
+        if let Err(exceeded) = ELEMENTS.check(self.elements.len() as u64 + 1) {
+            return self.refuse(exceeded.to_string());
+        }
+        self.elements.push(one);
+        Ok(())
     }
 
     /// Count a field that is left out.

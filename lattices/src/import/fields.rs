@@ -115,6 +115,5 @@ pub(super) fn give(lattice: &mut Lattice, mut element: Element, of: Strengths) -
     if of.is_higher {
         lattice.leave_out("octupole or higher field (none to first order on the reference orbit)");
     }
-    lattice.elements.push(element);
-    Ok(())
+    lattice.push(element)
 }

@@ -11,6 +11,7 @@ use super::element::{Element, Format, Lattice, Role};
 use super::fields::{NONE, Strengths, give};
 use measured::MeasuredError;
 use measured::folder::Particle;
+use twin::limits::TEXT;
 
 /// Columns that a ring needs.
 const COLUMNS: [&str; 17] = [
@@ -39,6 +40,9 @@ pub(super) fn read(file: &str, text: &str) -> Result<Lattice, MeasuredError> {
     let mut columns: HashMap<String, usize> = HashMap::new();
     let mut s = 0.0;
     for (index, line) in text.lines().enumerate() {
+        if let Err(exceeded) = TEXT.check(line.len() as u64) {
+            return lattice.refuse(format!("line {}: {exceeded}", index + 1));
+        }
         let mut words = line.split_whitespace();
         match words.next() {
             None | Some("$") => {}

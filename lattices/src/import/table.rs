@@ -1,14 +1,14 @@
 //! A plain table of numbers: separated by commas, semicolons, tabs or spaces, with names in the first line and in the first column or without; or a
 //! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
 
-use std::fs;
 use std::path::Path;
 
 use super::hdf5::{self, Matrix};
 use super::instruments::{Channel, Instrument, Order, channel, in_order};
 use super::mat::MatFile;
-use super::source::Source;
+use super::source::{Source, bytes};
 use measured::MeasuredError;
+use twin::limits::{Budget, Exceeded, MEMORY, TEXT};
 
 /// A table as it was read.
 #[derive(Debug, Clone)]
@@ -35,7 +35,7 @@ impl Table {
     pub fn read(path: &Path) -> Result<Self, MeasuredError> {
         let source = Source::of(path);
         let file = source.path.display().to_string();
-        let bytes = fs::read(&source.path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
+        let bytes = bytes(&source.path)?;
         if MatFile::is_one(&bytes) {
             return Self::of(path, MatFile::of(&file, bytes)?.matrix(source.name.as_deref())?);
         }
@@ -207,11 +207,20 @@ fn is_number(cell: &str) -> bool {
 
 /// Cells of each line that has some, with the number of the line; `#` begins a comment.
 fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredError> {
+    let refused = |problem: String| MeasuredError::Table { file: file.into(), problem };
+    if let Some((number, exceeded)) = long(text) {
+        return Err(refused(format!("line {number}: {exceeded}")));
+    }
+    let memory = Budget::new(MEMORY);
+    let whole = |number: usize, cells: Vec<&str>| {
+        let bytes = LINE + cells.iter().map(|cell| CELL + cell.len()).sum::<usize>();
+        memory.take(bytes as u64).map_err(|exceeded| refused(format!("line {number}: {exceeded}")))?;
+        Ok((number, cells.into_iter().map(str::to_owned).collect()))
+    };
     let Some(delimiter) = [',', ';', '\t'].into_iter().find(|one| text.contains(*one)) else {
         let lines = text.lines().enumerate().filter(|(_, line)| !line.trim_start().starts_with('#'));
-        let words =
-            lines.map(|(number, line)| (number + 1, line.split_whitespace().map(str::to_owned).collect::<Vec<_>>()));
-        return Ok(words.filter(|(_, words)| !words.is_empty()).collect());
+        let words = lines.map(|(number, line)| (number + 1, line.split_whitespace().collect::<Vec<_>>()));
+        return words.filter(|(_, words)| !words.is_empty()).map(|(number, words)| whole(number, words)).collect();
     };
     let mut reader = csv::ReaderBuilder::new()
         .has_headers(false)
@@ -221,9 +230,18 @@ fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredEr
         .delimiter(delimiter as u8)
         .from_reader(text.as_bytes());
     let lines = reader.records().map(|record| {
-        let record = record.map_err(|error| MeasuredError::Table { file: file.into(), problem: error.to_string() })?;
-        let number = record.position().map_or(0, |position| position.line() as usize);
-        Ok((number, record.iter().map(str::to_owned).collect()))
+        let record = record.map_err(|error| refused(error.to_string()))?;
+        whole(record.position().map_or(0, |position| position.line() as usize), record.iter().collect())
     });
     lines.collect()
+}
+
+/// What a line takes before and after its cells are numbers [B].
+const LINE: usize = 2 * size_of::<Line>();
+/// What a cell takes beside its text, and its number after that [B].
+const CELL: usize = size_of::<String>() + size_of::<f64>();
+
+/// A line that is too long.
+fn long(text: &str) -> Option<(usize, Exceeded)> {
+    text.lines().enumerate().find_map(|(index, line)| Some((index + 1, TEXT.check(line.len() as u64).err()?)))
 }
