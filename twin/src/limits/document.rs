@@ -2,10 +2,10 @@
 
 use core::fmt;
 
-use serde::de::{Deserialize, DeserializeSeed, Deserializer, Error, MapAccess, SeqAccess, Visitor};
+use serde::de::{Deserialize, DeserializeOwned, DeserializeSeed, Deserializer, Error, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Number, Value};
 
-use super::{Budget, DEPTH, Exceeded, MEMORY, TEXT};
+use super::{Budget, DEPTH, Exceeded, FINITE, MEMORY, TEXT};
 
 /// The values of a document; a number that is not finite is null, as it is in JSON.
 #[derive(Debug, Clone, PartialEq)]
@@ -17,6 +17,30 @@ impl<'de> Deserialize<'de> for Document {
     }
 }
 
+/// JSON of our own as a type: a document whose numbers are within [`FINITE`].
+///
+/// # Errors
+/// Where it is none, by serde_json; the path of a number.
+pub fn json<T: DeserializeOwned>(text: &str) -> serde_json::Result<T> {
+    let Document(value) = serde_json::from_str(text)?;
+    check(&value).map_err(serde_json::Error::custom)?;
+    serde_json::from_str(text)
+}
+
+fn check(value: &Value) -> Result<(), String> {
+    match value {
+        Value::Number(number) if number.is_f64() => FINITE.check(number.as_f64().unwrap_or(f64::NAN)).map(drop),
+        Value::Array(all) => {
+            let each = |(at, value)| check(value).map_err(|problem| format!("entry {}: {problem}", at + 1));
+            all.iter().enumerate().try_for_each(each)
+        }
+        Value::Object(all) => {
+            all.iter().try_for_each(|(name, value)| check(value).map_err(|problem| format!("{name}: {problem}")))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// A value within so many others.
 #[derive(Clone, Copy)]
 struct Bounded<'b> {
@@ -24,11 +48,13 @@ struct Bounded<'b> {
     depth: u64,
 }
 
-/// What a value takes in a list, and beside its text [B].
+/// What a value takes beside its text [B].
 const VALUE: u64 = size_of::<Value>() as u64;
 /// Entries that a node of a map holds at least when it is split, and what the node takes [B].
 const ENTRIES: usize = 6;
 const NODE: u64 = 640;
+/// How serde_json hands over a number where a dependency has it keep all digits.
+const DIGITS: &str = "$serde_json::private::Number";
 
 impl Bounded<'_> {
     fn take<E: Error>(self, bytes: u64) -> Result<(), E> {
@@ -111,6 +137,8 @@ impl<'de> Visitor<'de> for Bounded<'_> {
         let inner = self.within()?;
         let mut values = Vec::new();
         while let Some(value) = list.next_element_seed(inner)? {
+            // a list that grows has room for twice its values
+            self.take(VALUE)?;
             values.push(value);
         }
         Ok(Value::Array(values))
@@ -120,6 +148,9 @@ impl<'de> Visitor<'de> for Bounded<'_> {
         let inner = self.within()?;
         let mut map = Map::new();
         while let Some(name) = entries.next_key::<String>()? {
+            if name == DIGITS {
+                return entries.next_value::<String>()?.parse().map(Value::Number).map_err(A::Error::custom);
+            }
             self.check_text(&name)?;
             if map.len().is_multiple_of(ENTRIES) {
                 self.take(NODE)?;
@@ -143,6 +174,17 @@ mod tests {
         let text =
             r#"{"a": [1, -2, 2.5e-3, 1e300, true, null, "text", {}, []], "b": {"c": {"d": 18446744073709551615}}}"#;
         assert_eq!(serde_json::from_str::<Document>(text).unwrap().0, serde_json::from_str::<Value>(text).unwrap());
+    }
+
+    #[test]
+    fn a_number_that_is_too_large_is_said_with_its_path() {
+        let said = json::<Value>(r#"{"elements": [{"length": 1}, {"length": -1e300}]}"#).unwrap_err().to_string();
+        assert_eq!(said, "elements: entry 2: length: expected a number from -1e15 to 1e15, found -1e300");
+        // numbers are not the objects that serde_json may hand over
+        let many = format!("[{}0]", "0.5,".repeat(2_000_000));
+        assert!(json::<Vec<f64>>(&many).is_ok());
+        // a seed is no number of a measurement
+        assert_eq!(json::<Vec<u64>>("[18446744073709551615]").unwrap(), [u64::MAX]);
     }
 
     #[test]

@@ -6,10 +6,10 @@ mod range;
 
 use core::cell::Cell;
 use std::fs::File;
-use std::io::{self, ErrorKind, Read};
+use std::io::{self, BufRead, ErrorKind, Read};
 use std::path::Path;
 
-pub use document::Document;
+pub use document::{Document, json};
 pub use range::{FINITE, NOT_NEGATIVE, POSITIVE, Range, SECONDS};
 
 /// The most of something that is counted.
@@ -60,8 +60,14 @@ impl Limit {
     /// # Errors
     /// What the system says, or [`ErrorKind::FileTooLarge`].
     pub fn bytes(self, path: &Path) -> io::Result<Vec<u8>> {
-        let too_large = |exceeded| io::Error::new(ErrorKind::FileTooLarge, exceeded);
-        let file = File::open(path)?;
+        self.bytes_of(&File::open(path)?)
+    }
+
+    /// The same of a file that is open.
+    ///
+    /// # Errors
+    /// As [`Limit::bytes`].
+    pub fn bytes_of(self, file: &File) -> io::Result<Vec<u8>> {
         // a device states no length
         self.check(file.metadata()?.len()).map_err(too_large)?;
         let mut bytes = Vec::new();
@@ -75,8 +81,27 @@ impl Limit {
     /// # Errors
     /// As [`Limit::bytes`], or [`ErrorKind::InvalidData`].
     pub fn text(self, path: &Path) -> io::Result<String> {
-        String::from_utf8(self.bytes(path)?).map_err(|_| io::Error::new(ErrorKind::InvalidData, "expected UTF-8 text"))
+        text(self.bytes(path)?)
     }
+
+    /// Lines of a stream, whose lengths this limits; an error is the last of them.
+    pub fn lines(self, mut from: impl BufRead) -> impl Iterator<Item = io::Result<String>> {
+        let mut line = move || {
+            let mut line = Vec::new();
+            from.by_ref().take(self.most + 1).read_until(b'\n', &mut line)?;
+            self.check(line.len() as u64).map_err(too_large)?;
+            text(line)
+        };
+        core::iter::from_fn(move || Some(line()).filter(|line| !line.as_ref().is_ok_and(String::is_empty)))
+    }
+}
+
+fn too_large(exceeded: Exceeded) -> io::Error {
+    io::Error::new(ErrorKind::FileTooLarge, exceeded)
+}
+
+fn text(bytes: Vec<u8>) -> io::Result<String> {
+    String::from_utf8(bytes).map_err(|_| io::Error::new(ErrorKind::InvalidData, "expected UTF-8 text"))
 }
 
 /// What is taken of a limit, bit by bit.
@@ -131,6 +156,15 @@ mod tests {
         std::fs::remove_file(&file).unwrap();
         #[cfg(unix)]
         assert_eq!(said(Path::new("/dev/zero")), "expected at most 4 bytes, found 5");
+    }
+
+    #[test]
+    fn a_stream_without_an_end_of_a_line_is_given_up() {
+        let limit = Limit { most: 4, of: "bytes" };
+        let lines: Vec<_> = limit.lines("ab\n\ncde".as_bytes()).map(Result::unwrap).collect();
+        assert_eq!(lines, ["ab\n", "\n", "cde"]);
+        let error = limit.lines(io::BufReader::new(io::repeat(b'x'))).next();
+        assert!(error.is_some_and(|line| line.is_err()));
     }
 
     #[test]
