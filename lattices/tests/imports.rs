@@ -305,7 +305,7 @@ fn what_the_twin_cannot_carry_is_refused_with_its_element() {
         (thin, "element T: a thin quadrupole of 0.3 /m"),
         (wiggler, "element W: class Wiggler acts on the orbit"),
         (vertical, "element V: a dipole rolled by 1.57"),
-        (infinite, "element I: Length: expected a finite number, found null"),
+        (infinite, "element I: Length: expected a number from -1e15 to 1e15, found null"),
     ] {
         let (_folder, path) = at(element);
         let found = refused(&path);
@@ -437,7 +437,9 @@ fn tables_that_do_not_fit_are_refused() {
             .contains("x:BPM[13] is none of the lattice's, which are x:BPM[1], y:BPM[1]")
     );
     assert!(said(",x:COR[1],x:COR[1]\nx:BPM[1],0.5,1\n", None).contains("columns: number 2 stands there twice"));
-    assert!(said(",x:COR[1]\nx:BPM[1],a\n", None).contains("line 2: expected a number, found a"));
+    assert!(
+        said(",x:COR[1]\nx:BPM[1],a\n", None).contains("line 2: expected a number from -1e15 to 1e15, found \"a\"")
+    );
     assert!(said("", None).contains("no line of numbers"));
     assert!(said("# by hand\n; x:COR[1]; y:COR[2]\nx:BPM[2]; 0.5;\n", None).contains("0.5, NaN"));
 }

@@ -34,7 +34,7 @@ pub(super) fn matrix(source: &Source, bytes: Vec<u8>) -> Result<Matrix, Measured
     let have = || {
         let mut found = Vec::new();
         list(&file.root(), "", &mut found);
-        found.iter().take(12).cloned().collect::<Vec<_>>().join(", ")
+        found.join(", ")
     };
     let Some(path) = &source.name else {
         return Err(refused(format!("name a dataset, {name}:PATH; it has {}", have())));
@@ -103,14 +103,17 @@ fn words(dataset: &Dataset) -> String {
     if shape.is_empty() { kind } else { format!("{shape} {kind}") }
 }
 
-/// Paths of the datasets, with their dimensions.
+/// Datasets that an error lists.
+const LISTED: usize = 12;
+
+/// Paths of the first datasets, with their dimensions.
 fn list(group: &Group, path: &str, found: &mut Vec<String>) {
-    for name in group.datasets().unwrap_or_default() {
+    for name in group.datasets().unwrap_or_default().into_iter().take(LISTED - found.len()) {
         let words = group.dataset(&name).map_or_else(|error| error.to_string(), |one| words(&one));
         found.push(format!("{path}/{name} ({words})"));
     }
     if path.matches('/').count() < 4 {
-        for name in group.groups().unwrap_or_default() {
+        for name in group.groups().unwrap_or_default().into_iter().take(LISTED) {
             if let Ok(inner) = group.group(&name) {
                 list(&inner, &format!("{path}/{name}"), found);
             }

@@ -8,7 +8,7 @@ use super::instruments::{Channel, Instrument, Order, channel, in_order};
 use super::mat::MatFile;
 use super::source::{Source, bytes};
 use measured::MeasuredError;
-use twin::limits::{Budget, Exceeded, MEMORY, TEXT};
+use twin::limits::{Budget, Exceeded, FINITE, MEMORY, TEXT};
 
 /// A table as it was read.
 #[derive(Debug, Clone)]
@@ -56,8 +56,9 @@ impl Table {
         let rows = lines.map(|(at, values)| Line { number: at + 1, name: None, values: values.to_vec() }).collect();
         let mut table = Self { file: path.display().to_string(), columns: None, rows };
         table.check()?;
-        match values.iter().position(|one| one.is_infinite()) {
-            Some(at) => table.refuse(format!("line {}: expected a number, found {}", at / width + 1, values[at])),
+        let mut numbers = values.iter().enumerate().filter(|(_, one)| !one.is_nan());
+        match numbers.find_map(|(at, one)| Some((at, FINITE.check(*one).err()?))) {
+            Some((at, problem)) => table.refuse(format!("line {}: {problem}", at / width + 1)),
             None => Ok(table),
         }
     }
@@ -100,10 +101,8 @@ impl Table {
         let name = (!is_number(&cells[0])).then(|| cells.remove(0));
         let values = cells.iter().map(|cell| match cell.as_str() {
             "" => Ok(f64::NAN),
-            cell => match cell.parse::<f64>() {
-                Ok(value) if !value.is_infinite() => Ok(value),
-                _ => self.refuse(format!("line {number}: expected a number, found {cell}")),
-            },
+            cell if cell.parse().is_ok_and(f64::is_nan) => Ok(f64::NAN),
+            cell => FINITE.parse(cell).or_else(|problem| self.refuse(format!("line {number}: {problem}"))),
         });
         Ok(Line { number, name, values: values.collect::<Result<_, _>>()? })
     }
