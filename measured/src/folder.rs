@@ -441,6 +441,8 @@ fn matrix(file: &Path, rows: usize, columns: usize) -> Result<DMatrix<f64>, Meas
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     const LATTICE: &str = "index,name,s_entrance_m,length_m,bend_rad,edge_in_rad,edge_out_rad,k1_start_1_m2,k2_half_1_m3\n\

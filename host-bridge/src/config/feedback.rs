@@ -95,6 +95,8 @@ fn orbit(file: &Path) -> Result<BTreeMap<String, f32>, String> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn of(text: &str) -> Result<stream::Feedback, String> {

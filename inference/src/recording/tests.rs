@@ -1,5 +1,7 @@
 //! The document's examples, and one fault at a time.
 
+use std::fs;
+
 use super::*;
 
 /// The documents' examples are what these tests read, so that neither can drift from the other.
