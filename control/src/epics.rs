@@ -1,16 +1,17 @@
 //! EPICS, spoken by a process of its own: a kept library does it, and requests and replies pass as JSON lines.
 
 use core::time::Duration;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{self, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Stdio};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::thread;
 use std::time::Instant;
 
 use serde::Deserialize;
 use serde_json::{Value, json};
+use twin::limits::TEXT;
 
 use crate::channel::{Channel, Control, ControlError, Sample};
 
@@ -18,14 +19,22 @@ use crate::channel::{Channel, Control, ControlError, Sample};
 pub struct Epics {
     process: Child,
     requests: Option<ChildStdin>,
-    replies: Receiver<String>,
+    replies: Receiver<io::Result<String>>,
     asked: u64,
+    /// The last request that was replied to; the replies to those before it came too late, or never.
+    heard: u64,
     timeout: f64,
     began: Instant,
 }
 
 /// How much longer than a request may take the process is waited for: Python and its libraries start within a second or two [s].
 const GRACE: f64 = 20.0;
+
+/// Replies that wait to be read; a process that says more has to wait.
+const WAITING: usize = 16;
+
+/// Characters of a reply that are quoted.
+const QUOTED: usize = 200;
 
 /// How long the process may take to end by itself.
 const END: Duration = Duration::from_secs(5);
@@ -64,15 +73,10 @@ impl Epics {
             ))
         })?;
         let (requests, replies) = (process.stdin.take(), process.stdout.take().expect("it is piped"));
-        let (send, receive) = channel();
-        thread::spawn(move || {
-            for line in BufReader::new(replies).lines().map_while(Result::ok) {
-                if send.send(line).is_err() {
-                    return;
-                }
-            }
-        });
-        Ok(Self { process, requests, replies: receive, asked: 0, timeout, began: Instant::now() })
+        let (send, receive) = sync_channel(WAITING);
+        // ends with the lines, or when nobody listens any more
+        thread::spawn(move || TEXT.lines(BufReader::new(replies)).try_for_each(|line| send.send(line)));
+        Ok(Self { process, requests, replies: receive, asked: 0, heard: 0, timeout, began: Instant::now() })
     }
 
     fn ask(&mut self, mut request: Value) -> Result<Reply, ControlError> {
@@ -85,7 +89,8 @@ impl Epics {
         let deadline = Instant::now() + Duration::from_secs_f64(self.timeout + GRACE);
         loop {
             let line = match self.replies.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
-                Ok(line) => line,
+                Ok(Ok(line)) => line,
+                Ok(Err(error)) => return Err(self.given_up(&error.to_string())),
                 Err(RecvTimeoutError::Disconnected) => return Err(gone()),
                 Err(RecvTimeoutError::Timeout) => {
                     let waited = self.timeout + GRACE;
@@ -95,12 +100,26 @@ impl Epics {
                 }
             };
             let reply: Reply = serde_json::from_str(&line).map_err(|error| {
+                let line: String = line.chars().take(QUOTED).collect();
                 ControlError::Process(format!("the process that speaks EPICS said {line:?}: {error}"))
             })?;
+            if !(self.heard + 1..=self.asked).contains(&reply.id) {
+                let (asked, found) = (self.asked, reply.id);
+                return Err(self.given_up(&format!("expected a reply to request {asked}, found one to {found}")));
+            }
+            self.heard = reply.id;
             if reply.id == self.asked {
                 return Ok(reply);
             }
         }
+    }
+}
+
+impl Epics {
+    /// The process says what nobody asked for, and may go on with it: its end is not waited for.
+    fn given_up(&mut self, why: &str) -> ControlError {
+        let _ = self.process.kill();
+        ControlError::Process(format!("the process that speaks EPICS: {why}"))
     }
 }
 

@@ -3,10 +3,11 @@
 //! One JSON object a line, on the disk before the next thing is done. A journal is there as long as its measurement is not finished.
 
 use std::fs::{File, OpenOptions, TryLockError};
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, ErrorKind, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use twin::limits::FILE;
 
 use crate::frame::Frame;
 use crate::plan::{Channels, Plan};
@@ -107,8 +108,8 @@ impl Journal {
             Err(TryLockError::Error(error)) => return Err(failed(error)),
             Ok(()) => {}
         }
-        let mut text = String::new();
-        file.read_to_string(&mut text).map_err(failed)?;
+        let bytes = FILE.bytes_of(&file).map_err(failed)?;
+        let text = String::from_utf8(bytes).map_err(|error| failed(io::Error::new(ErrorKind::InvalidData, error)))?;
         // a line without its end was being written when the process was killed; nothing that it announces was done
         let whole = text.rfind('\n').map_or(0, |end| end + 1);
         let entry = |(index, line): (usize, &str)| {

@@ -1,13 +1,13 @@
 //! `PLAN.toml`: what is measured, by which channels, within which limits. The page is `docs/control-system.md`.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use inference::RecordingError;
 use inference::recording::{Format, Header, Names};
 use serde::{Deserialize, Serialize};
 use twin::Ring;
+use twin::limits::{FINITE, FRAMES, NOT_NEGATIVE, Range, SECONDS, SETTINGS};
 
 use crate::step::Step;
 
@@ -179,6 +179,11 @@ struct TimingFile {
     match_window_s: f64,
 }
 
+/// Currents that are set and told apart.
+const AMPERES: Range = Range::new(1e-6, 1e6, "A");
+/// Frequencies, and steps of them.
+const HERTZ: Range = Range::new(1e-6, 1e12, "Hz");
+
 /// What stands for the name of a device in a channel's name.
 const DEVICE: &str = "{device}";
 
@@ -190,11 +195,11 @@ impl Plan {
     pub fn read(file: &Path, ring: &Ring) -> Result<Self, PlanError> {
         let unreadable =
             |path: &Path, error: std::io::Error| PlanError::Unreadable(path.into(), twin::unreadable(&error));
-        let text = fs::read_to_string(file).map_err(|error| unreadable(file, error))?;
+        let text = SETTINGS.text(file).map_err(|error| unreadable(file, error))?;
         let plan: PlanFile = toml::from_str(&text).map_err(|error| written(file, &text, &error))?;
         let header_file = file.parent().unwrap_or(Path::new("")).join(&plan.header);
         let header = Header::read(&header_file, ring)?;
-        let header_text = fs::read_to_string(&header_file).map_err(|error| unreadable(&header_file, error))?;
+        let header_text = SETTINGS.text(&header_file).map_err(|error| unreadable(&header_file, error))?;
         let mut check = Check { ring, names: Names::from_ring(ring), wrong: Vec::new() };
         check.expect(header.format == Format::Two, || format!("{}: expected format = 2", header_file.display()));
         let resolved = check.plan(&plan, header, header_text);
@@ -222,28 +227,29 @@ impl Check<'_> {
         }
     }
 
-    fn positive(&mut self, key: &str, value: f64) {
-        self.expect(value.is_finite() && value > 0.0, || format!("{key}: expected a positive number, found {value}"));
+    fn within(&mut self, range: Range, key: &str, value: f64) {
+        self.wrong.extend(range.check(value).err().map(|problem| format!("{key}: {problem}")));
     }
 
     fn plan(&mut self, file: &PlanFile, header: Header, header_text: String) -> Plan {
         let channels = self.channels(&file.channels, header.nominal_dipole.is_some());
         let correctors = self.correctors(&file.correctors);
         let timing = &file.timing;
-        self.positive("timing.settle_s", timing.settle_s);
-        self.positive("timing.timeout_s", timing.timeout_s);
-        self.positive("timing.match_window_s", timing.match_window_s);
-        self.expect(file.frames.repeats > 0, || "frames.repeats: expected 1 or more, found 0".into());
+        self.within(SECONDS, "timing.settle_s", timing.settle_s);
+        self.within(SECONDS, "timing.timeout_s", timing.timeout_s);
+        self.within(SECONDS, "timing.match_window_s", timing.match_window_s);
         let time = file.frames.time_in_cycle_ms;
-        self.expect(time.is_finite() && time >= 0.0, || {
-            format!("frames.time_in_cycle_ms: expected a number from 0, found {time}")
-        });
+        self.within(NOT_NEGATIVE, "frames.time_in_cycle_ms", time);
         let mut steps = correctors;
         if let Some(rf) = &file.rf {
             self.expect(channels.rf.is_some(), || "rf: expected channels.rf_set_Hz and rf_read_Hz".into());
             steps.extend(self.rf(rf));
         }
         self.expect(!steps.is_empty(), || "correctors.measure: expected a corrector or RF steps, found none".into());
+        let repeats = file.frames.repeats;
+        self.expect(repeats > 0, || "frames.repeats: expected 1 or more, found 0".into());
+        let frames = FRAMES.check((steps.len() as u64).saturating_mul(repeats as u64));
+        self.wrong.extend(frames.err().map(|exceeded| format!("frames.repeats: {exceeded}")));
         let rf = file.rf.as_ref();
         Plan {
             header,
@@ -251,7 +257,7 @@ impl Check<'_> {
             channels,
             corrector_names: self.names.correctors.clone(),
             steps,
-            repeats: file.frames.repeats,
+            repeats,
             cycle_time: time / 1000.0,
             corrector_tolerance: file.correctors.tolerance,
             corrector_limits: file.correctors.limits,
@@ -267,13 +273,17 @@ impl Check<'_> {
     /// Each corrector at 0 and at plus and minus the amplitude.
     fn correctors(&mut self, file: &CorrectorsFile) -> Vec<Step> {
         let (amplitude, [low, high]) = (file.amplitude, file.limits);
-        self.positive("correctors.amplitude_A", amplitude);
-        self.positive("correctors.tolerance_A", file.tolerance);
+        self.within(AMPERES, "correctors.amplitude_A", amplitude);
+        self.within(AMPERES, "correctors.tolerance_A", file.tolerance);
+        [low, high].iter().for_each(|limit| self.within(FINITE, "correctors.limits_A", *limit));
         self.expect(low <= -amplitude && amplitude <= high, || {
-            format!("correctors.limits_A: expected -{amplitude} to {amplitude} A within them, found {low} to {high} A")
+            format!("correctors.limits_A: expected -{amplitude:?} to {amplitude:?} A within them, found {low:?} to {high:?} A")
         });
         self.expect(file.tolerance < amplitude, || {
-            format!("correctors.tolerance_A: expected less than amplitude_A = {amplitude}, found {}", file.tolerance)
+            format!(
+                "correctors.tolerance_A: expected less than amplitude_A = {amplitude:?}, found {:?}",
+                file.tolerance
+            )
         });
         let all = self.names.correctors.clone();
         let measured = file.measure.as_ref().unwrap_or(&all);
@@ -300,12 +310,13 @@ impl Check<'_> {
 
     /// The frequency as it is, and each step.
     fn rf(&mut self, file: &RfFile) -> Vec<Step> {
-        self.positive("rf.tolerance_Hz", file.tolerance);
+        self.within(HERTZ, "rf.tolerance_Hz", file.tolerance);
         let [low, high] = file.limits;
+        [low, high].iter().for_each(|limit| self.within(HERTZ, "rf.limits_Hz", *limit));
         self.expect(0.0 < low && low < high, || {
             format!("rf.limits_Hz: expected two rising numbers, found {low}, {high}")
         });
-        file.nominal.iter().for_each(|nominal| self.positive("rf.nominal_Hz", *nominal));
+        file.nominal.iter().for_each(|nominal| self.within(HERTZ, "rf.nominal_Hz", *nominal));
         for step in &file.steps_relative {
             self.expect(*step != 0.0 && step.abs() <= 0.01, || {
                 format!("rf.steps_relative: expected numbers from -0.01 to 0.01 without 0, found {step}")

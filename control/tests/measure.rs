@@ -238,9 +238,9 @@ fn all_wrong_values_of_a_plan_are_said_at_once() {
     std::fs::write(&file, changed).unwrap();
     let said = Plan::read(&file, &ring).unwrap_err().to_string();
     for part in [
-        "correctors.limits_A: expected -30 to 30 A within them, found -25 to 25 A",
+        "correctors.limits_A: expected -30.0 to 30.0 A within them, found -25.0 to 25.0 A",
         "frames.repeats: expected 1 or more, found 0",
-        "timing.settle_s: expected a positive number, found -1",
+        "timing.settle_s: expected a number from 0.001 to 86400 s, found -1",
         "correctors.skip: expected correctors of AGS Booster (BNL), design model, found \"Z9\"",
         "rf.steps_relative: expected numbers from -0.01 to 0.01 without 0, found 0.2",
     ] {

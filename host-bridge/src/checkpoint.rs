@@ -13,6 +13,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use crc::{CRC_32_ISO_HDLC, Crc};
 use results::Remarked;
 use serde::{Deserialize, Serialize};
+use twin::limits::FILE;
 
 use crate::health::Health;
 use crate::source::queue::Faults;
@@ -174,7 +175,7 @@ fn expect(found: &Model, model: &Model) -> Result<(), CheckpointError> {
 /// # Errors
 /// [`CheckpointError`]; the file is as it was.
 pub fn read(path: &Path, model: &Model) -> Result<Option<Checkpoint>, CheckpointError> {
-    match fs::read(path) {
+    match FILE.bytes(path) {
         Ok(bytes) => Checkpoint::decode(&bytes, model).map(Some),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
         Err(error) => Err(CheckpointError::Read(error.to_string())),

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use results::CommandError;
 use serde::Deserialize;
 use toml::de::DeTable;
+use twin::limits::SETTINGS;
 
 pub use feedback::Feedback;
 
@@ -345,7 +346,7 @@ impl Config {
     /// [`ConfigError`] with everything that is wrong.
     pub fn read(file: &Path) -> Result<Self, ConfigError> {
         let unread = |reason: std::io::Error| vec![Problem { line: 0, what: reason.to_string() }];
-        let parsed = std::fs::read_to_string(file).map_err(unread).and_then(|text| Self::parse(&text));
+        let parsed = SETTINGS.text(file).map_err(unread).and_then(|text| Self::parse(&text));
         let mut config = parsed.map_err(|problems| ConfigError { file: file.to_owned(), problems })?;
         let folder = file.parent().unwrap_or(Path::new(""));
         let Self { machine, source, checkpoint, feedback, history, .. } = &mut config;

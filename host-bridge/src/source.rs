@@ -19,6 +19,7 @@ use std::time::Instant;
 
 use estimator::Prepared;
 use results::{EstimateRecord, Remarked, Timing};
+use twin::limits::Range;
 
 use crate::stop::Stop;
 
@@ -58,13 +59,14 @@ pub enum Rate {
     Hertz(f64),
 }
 
+/// Rates of a recording, from one frame a day.
+const RATES: Range = Range::new(1e-5, 1e6, "Hz or max");
+
 impl FromStr for Rate {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("expected max, or a number above 0 and below 1e9, found {text:?}");
-        let hertz = || text.parse().ok().filter(|v: &f64| *v > 0.0 && *v < 1e9).map(Self::Hertz);
-        if text == "max" { Ok(Self::Max) } else { hertz().ok_or_else(wrong) }
+        if text == "max" { Ok(Self::Max) } else { RATES.parse(text).map(Self::Hertz) }
     }
 }
 

@@ -18,6 +18,7 @@ use nuts_rs::{
 };
 
 use rand::Rng;
+use twin::limits::{DRAWS, Exceeded};
 
 use crate::draws::{Chain, DrawStats, Draws, Summary};
 use crate::posterior::{Laplace, Posterior};
@@ -66,6 +67,9 @@ pub enum NutsError {
     /// The sampler stopped.
     #[error("the sampler stopped: {0}")]
     Sampler(String),
+    /// More draws than are kept.
+    #[error("{0}, the warm-up counted")]
+    TooMany(#[from] Exceeded),
     /// The sampler's result is incomplete.
     #[error("the sampler's result has no {0}")]
     Missing(&'static str),
@@ -138,6 +142,7 @@ pub fn explore<D: Density>(
     settings: NutsSettings,
     mut progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<NutsRun, NutsError> {
+    DRAWS.check((settings.warm_up + settings.draws) as u64 * (settings.chains * names.len()) as u64)?;
     let options = DiagNutsSettings {
         num_chains: settings.chains,
         num_tune: settings.warm_up as u64,

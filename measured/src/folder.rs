@@ -3,8 +3,7 @@
 //! `lattice.csv` has one row an element, `bpms.csv` and `correctors.csv` one row a monitor or corrector and plane, `orm_measured_mm.csv` the
 //! change of the orbit [mm] from minus to plus half a corrector's kick, `meta.json` what else was written down.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
 use nalgebra::{DMatrix, DVector};
@@ -12,6 +11,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use twin::Plane;
+use twin::limits::{self, Budget, FILE, FINITE, MEMORY, POSITIVE};
 
 use crate::error::MeasuredError;
 
@@ -232,6 +232,9 @@ fn yes<'de, D: serde::Deserializer<'de>>(from: D) -> Result<bool, D::Error> {
     Ok(u8::deserialize(from)? != 0)
 }
 
+/// What an element of a matrix takes in memory, a model's beside it [B].
+const NUMBER: u64 = 2 * size_of::<f64>() as u64;
+
 impl Folder {
     /// True of a folder that holds a measured matrix.
     pub fn is_one(path: &Path) -> bool {
@@ -247,7 +250,7 @@ impl Folder {
         let (lattice, monitors, correctors): (Vec<Row>, Vec<MonitorRow>, Vec<CorrectorRow>) =
             (rows(&path.join("lattice.csv"))?, rows(&path.join("bpms.csv"))?, rows(&path.join("correctors.csv"))?);
         let file = path.join("meta.json");
-        let meta = serde_json::from_str(&text(&file)?).map_err(|e| table(&file, e.to_string()))?;
+        let meta = limits::json(&text(&file)?).map_err(|e| table(&file, e.to_string()))?;
         let file = path.join("orm_measured_mm.csv");
         let matrix = matrix(&file, monitors.len(), correctors.len())?;
         let file = path.join("dispersion_orbit_mm.csv");
@@ -296,6 +299,11 @@ impl Folder {
         if last == 0 {
             return Err(table(&path.join("lattice.csv"), "expected elements, found none".into()));
         }
+        for (row, one) in self.lattice.iter().enumerate() {
+            let numbers = [one.s, one.length, one.bend, one.edge_in, one.edge_out, one.fringe, one.k1, one.half_k2];
+            let wrong = |problem| table(&path.join("lattice.csv"), format!("row {row}: {problem}"));
+            numbers.iter().try_for_each(|number| FINITE.check(*number).map(drop)).map_err(wrong)?;
+        }
         self.meta.check(last).map_err(|problem| table(&path.join("meta.json"), problem))?;
         let mut places = (self.monitors.iter().map(|one| ("bpms.csv", one.at)))
             .chain(self.correctors.iter().map(|one| ("correctors.csv", one.at)));
@@ -303,21 +311,23 @@ impl Folder {
             return Err(table(&path.join(file), format!("lattice_index {at}, lattice.csv has rows 0 to {}", last - 1)));
         }
         for (row, one) in self.monitors.iter().enumerate().filter(|(_, one)| one.is_used) {
-            if !(one.sigma > 0.0 && one.sigma.is_finite()) {
+            if POSITIVE.check(one.sigma).is_err() {
                 let problem = format!("row {row}: sigma_mm {}, expected above 0 where the monitor is used", one.sigma);
                 return Err(table(&path.join("bpms.csv"), problem));
             }
         }
         for (row, one) in self.correctors.iter().enumerate().filter(|(_, one)| one.is_used) {
-            if one.kick == 0.0 || !one.kick.is_finite() {
+            if POSITIVE.check(one.kick.abs()).is_err() {
                 let problem =
                     format!("row {row}: nominal_kick_mrad {}, expected one where the corrector is used", one.kick);
                 return Err(table(&path.join("correctors.csv"), problem));
             }
         }
         let twice = |file: &str, places: Vec<(Plane, usize)>| {
-            let pairs = (0..places.len()).find_map(|j| (0..j).find(|&i| places[i] == places[j]).map(|i| (i, j)));
-            pairs.map(|(i, j)| {
+            let mut first = HashMap::new();
+            let mut each = places.iter().enumerate();
+            let pair = each.find_map(|(j, (plane, at))| first.insert((plane.index(), *at), j).map(|i| (i, j)));
+            pair.map(|(i, j)| {
                 let plane = if places[i].0 == Plane::X { "x" } else { "y" };
                 let problem =
                     format!("rows {i} and {j} are both {plane} at lattice_index {}, expected one", places[i].1);
@@ -359,13 +369,19 @@ pub(crate) fn table(file: &Path, problem: String) -> MeasuredError {
 }
 
 pub(crate) fn text(file: &Path) -> Result<String, MeasuredError> {
-    fs::read_to_string(file).map_err(|source| MeasuredError::Read { file: file.display().to_string(), source })
+    FILE.text(file).map_err(|source| MeasuredError::Read { file: file.display().to_string(), source })
 }
 
 fn rows<T: DeserializeOwned>(file: &Path) -> Result<Vec<T>, MeasuredError> {
     let text = text(file)?;
     let mut reader = csv::Reader::from_reader(text.as_bytes());
-    reader.deserialize().collect::<Result<_, _>>().map_err(|error: csv::Error| table(file, error.to_string()))
+    let memory = Budget::new(MEMORY);
+    let row = |row: Result<T, csv::Error>| {
+        let row = row.map_err(|error| table(file, error.to_string()))?;
+        memory.take(size_of::<T>() as u64).map_err(|exceeded| table(file, exceeded.to_string()))?;
+        Ok(row)
+    };
+    reader.deserialize().map(row).collect()
 }
 
 /// What an instrument is called in a table: its plane and its row of the lattice.
@@ -385,6 +401,10 @@ pub(crate) fn number(field: &str) -> Option<f64> {
 fn matrix(file: &Path, rows: usize, columns: usize) -> Result<DMatrix<f64>, MeasuredError> {
     let text = text(file)?;
     let mut reader = csv::Reader::from_reader(text.as_bytes());
+    let numbers = (rows as u64).saturating_mul(columns as u64);
+    MEMORY
+        .check(numbers.saturating_mul(NUMBER))
+        .map_err(|exceeded| table(file, format!("{rows} monitors x {columns} correctors: {exceeded}")))?;
     let mut matrix = DMatrix::from_element(rows, columns, f64::NAN);
     let mut found = 0;
     for (i, record) in reader.records().enumerate() {
@@ -412,6 +432,8 @@ fn matrix(file: &Path, rows: usize, columns: usize) -> Result<DMatrix<f64>, Meas
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     const LATTICE: &str = "index,name,s_entrance_m,length_m,bend_rad,edge_in_rad,edge_out_rad,k1_start_1_m2,k2_half_1_m3\n\

@@ -39,8 +39,8 @@ pub fn named(
     predicted: &DMatrix<f64>,
     [monitors, correctors]: [[usize; 2]; 2],
 ) -> Result<(Folder, RawOrbits), MeasuredError> {
-    let (shape, found, expected) =
-        (lattice.matrix.shape(), raw.change.shape(), (monitors.iter().sum(), correctors.iter().sum()));
+    let all = |counts: [usize; 2]| counts.into_iter().fold(0, usize::saturating_add);
+    let (shape, found, expected) = (lattice.matrix.shape(), raw.change.shape(), (all(monitors), all(correctors)));
     if found != expected {
         return Err(MeasuredError::Unlike(format!(
             "expected raw orbits of {} readings and {} correctors, found {} and {}",
@@ -58,6 +58,14 @@ pub fn named(
             measured: raw.change.view((first[0], first[1]), (monitors[p], correctors[p])).into_owned(),
             predicted: predicted.select_rows(&own_rows).select_columns(&own_columns),
         };
+        if block.predicted.is_empty() && !block.measured.is_empty() {
+            return Err(MeasuredError::Unlike(format!(
+                "{}: expected monitors and correctors in {plane:?} as the raw orbits have, found {} and {}",
+                lattice.name,
+                own_rows.len(),
+                own_columns.len()
+            )));
+        }
         let (of_rows, of_columns) = block.aligned();
         if 2 * of_rows.len() < monitors[p] || 2 * of_columns.len() < correctors[p] {
             return Err(MeasuredError::Unlike(format!(

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use nalgebra::DMatrix;
 use serde::Deserialize;
+use twin::limits::{self, Budget, MEMORY};
 
 use crate::error::MeasuredError;
 use crate::folder::{Folder, number, table, text};
@@ -46,7 +47,7 @@ impl RawOrbits {
     pub fn read(path: &Path) -> Result<Self, MeasuredError> {
         let file = ["raw_orbit_meta.json", "meta.json"].map(|name| path.join(name));
         let file = if file[0].is_file() { &file[0] } else { &file[1] };
-        let Currents { amperes } = serde_json::from_str(&text(file)?).map_err(|e| table(file, e.to_string()))?;
+        let Currents { amperes } = limits::json(&text(file)?).map_err(|e| table(file, e.to_string()))?;
         if let Some(wrong) = amperes.iter().position(|one| !(one.is_finite() && *one != 0.0)) {
             let problem = format!("actuator_delta_A, entry {}: expected a current other than 0", wrong + 1);
             return Err(table(file, problem));
@@ -95,24 +96,27 @@ impl RawOrbits {
         self
     }
 
-    /// What the orbit drifts from one pair to the next [mm]: rms of a monitor, the median over some.
-    pub fn drift(&self, monitors: &[usize]) -> f64 {
+    /// What the orbit drifts from one pair to the next [mm]: rms of a monitor, the median over some; none where no monitor read two of them.
+    pub fn drift(&self, monitors: &[usize]) -> Option<f64> {
         let steps = |row: usize| {
             let read: Vec<f64> = self.middle.row(row).iter().copied().filter(|one| one.is_finite()).collect();
             let squares: f64 = read.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum();
-            (squares / (read.len().max(2) - 1) as f64).sqrt()
+            (read.len() > 1).then(|| (squares / (read.len() - 1) as f64).sqrt())
         };
-        let mut all: Vec<f64> = monitors.iter().map(|&row| steps(row)).collect();
+        let mut all: Vec<f64> = monitors.iter().filter_map(|&row| steps(row)).collect();
         all.sort_by(f64::total_cmp);
-        all.get(all.len() / 2).copied().unwrap_or(0.0)
+        all.get(all.len() / 2).copied()
     }
 }
+
+/// What a number takes in memory: in its list and in its matrix, of both files, and in the change and the middle [B].
+const NUMBER: u64 = 6 * size_of::<f64>() as u64;
 
 /// A table of numbers alone; an empty field was not read.
 fn numbers(file: &Path, columns: usize) -> Result<DMatrix<f64>, MeasuredError> {
     let text = text(file)?;
     let mut reader = csv::ReaderBuilder::new().has_headers(false).flexible(true).from_reader(text.as_bytes());
-    let (mut rows, mut all) = (0, Vec::new());
+    let (mut rows, mut all, memory) = (0, Vec::new(), Budget::new(MEMORY));
     for record in reader.records() {
         let record = record.map_err(|error| table(file, error.to_string()))?;
         rows += 1;
@@ -123,6 +127,7 @@ fn numbers(file: &Path, columns: usize) -> Result<DMatrix<f64>, MeasuredError> {
             );
             return Err(table(file, problem));
         }
+        memory.take(NUMBER * columns as u64).map_err(|exceeded| table(file, format!("line {rows}: {exceeded}")))?;
         for (column, field) in record.iter().enumerate() {
             let place = format!("line {rows}, column {}", column + 1);
             match number(field) {
@@ -161,7 +166,7 @@ mod tests {
         assert_eq!(raw.change.as_slice()[..3], [1.0, 1.0, 2.0]);
         assert_eq!(raw.middle.as_slice()[..3], [1.5, 3.5, 3.0]);
         assert!(raw.change[(1, 1)].is_nan() && raw.amperes == [0.5, 2.0]);
-        assert_eq!(raw.drift(&[0]), 1.5);
+        assert_eq!((raw.drift(&[0]), raw.drift(&[])), (Some(1.5), None));
     }
 
     #[test]

@@ -1,8 +1,10 @@
 //! The command line.
 
+use core::ops::RangeInclusive;
 use core::time::Duration;
 use std::path::PathBuf;
 
+use clap::builder::TypedValueParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use host_bridge::source::Rate;
 use host_bridge::source::address::Address;
@@ -10,7 +12,8 @@ use inference::nuts::NutsSettings;
 use lattices::export;
 use lattices::import::{self, Pattern};
 use shared_memory::{PUBLISHER, SERVICE};
-use twin::EffectText;
+use twin::limits::{self, ELEMENTS, FINITE, POSITIVE, SECONDS};
+use twin::{EffectText, ParameterPrior};
 use validation::UnmodelledKind;
 
 /// Real-time Bayesian calibration of an accelerator's digital twin.
@@ -94,7 +97,7 @@ impl Common {
 #[derive(Debug, Clone, Copy, Args)]
 pub struct Priors {
     /// Width of the prior of every var, such as 0.03; the machine file's without it
-    #[arg(long, value_name = "W", value_parser = width)]
+    #[arg(long, value_name = "W", value_parser = number(ParameterPrior::WIDTHS))]
     pub prior_width: Option<f64>,
     /// Range of every var, such as 0.94,1.06; the machine file's without it
     #[arg(long, value_name = "LOW,HIGH", value_parser = range)]
@@ -140,10 +143,10 @@ pub struct Replay {
     #[allow(missing_docs)] // flattened options carry their own docs
     pub priors: Priors,
     /// Random walk of each ln var, standard deviation per sqrt(cycle), lost cycles counted; 0 for a campaign, whose vars are constant
-    #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = walk)]
+    #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = single(VAR_WALKS))]
     pub process_noise: f32,
     /// Random walk of each baseline [um per sqrt(cycle)]: an orbit that drifts from frame to frame
-    #[arg(long, value_name = "UM", default_value_t = 0.0, value_parser = baseline_walk, conflicts_with = "follow")]
+    #[arg(long, value_name = "UM", default_value_t = 0.0, value_parser = single(BASELINE_WALKS), conflicts_with = "follow")]
     pub baseline_walk: f32,
     /// Follow a machine whose vars and baselines may drift, and look for steps of single vars
     #[arg(long, conflicts_with = "process_noise")]
@@ -188,7 +191,7 @@ pub struct Serve {
     pub load: bool,
     /// Random walk of each ln var, standard deviation per sqrt(cycle), of constant baselines; without it, vars walk by 1.5e-4
     /// and baselines by 2 um per sqrt(second)
-    #[arg(long, value_name = "S", requires = "feed", value_parser = walk)]
+    #[arg(long, value_name = "S", requires = "feed", value_parser = single(VAR_WALKS))]
     pub process_noise: Option<f32>,
     /// One CSV row a frame
     #[arg(long, value_name = "FILE")]
@@ -270,7 +273,7 @@ pub struct History {
     #[arg(long, value_name = "WHEN", value_parser = moment)]
     pub until: Option<u64>,
     /// Lines of the table, spread evenly over the time; JSON and CSV have all rows
-    #[arg(long, value_name = "N", default_value_t = 20)]
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = whole(0..=1_000_000))]
     pub rows: usize,
     /// JSON of all rows, `-` for stdout
     #[arg(long, value_name = "FILE")]
@@ -365,7 +368,7 @@ pub struct Simulate {
     #[arg(long = "fault", value_name = "FAULT")]
     pub faults: Vec<String>,
     /// Time constant of the correctors' supplies [s]
-    #[arg(long, value_name = "S", default_value_t = 0.3)]
+    #[arg(long, value_name = "S", default_value_t = 0.3, value_parser = number(SECONDS))]
     pub settling_s: f64,
     /// What is true, for whoever judges: one CSV row a cycle, each monitor's reading [mm] without noise, jumps and faults
     #[arg(long, value_name = "FILE.csv")]
@@ -540,10 +543,10 @@ pub struct Import {
     #[arg(long, value_name = "FILE", requires = "rf_step", requires = "matrix")]
     pub dispersion: Option<PathBuf>,
     /// That step [Hz]
-    #[arg(long, value_name = "HZ", requires = "dispersion", allow_hyphen_values = true)]
+    #[arg(long, value_name = "HZ", requires = "dispersion", allow_hyphen_values = true, value_parser = number(FINITE))]
     pub rf_step: Option<f64>,
     /// RF frequency [Hz]; that of the lattice's cavities without it
-    #[arg(long, value_name = "HZ")]
+    #[arg(long, value_name = "HZ", value_parser = number(POSITIVE))]
     pub rf_frequency: Option<f64>,
     /// What the machine held while the matrix was measured, for the comparison with the lattice; the frequency without it
     #[arg(long, value_enum)]
@@ -729,16 +732,16 @@ pub struct Validate {
     #[allow(missing_docs)] // flattened options carry their own docs
     pub common: Common,
     /// Campaigns of a machine that the model describes
-    #[arg(long, value_name = "N", default_value_t = 300)]
+    #[arg(long, value_name = "N", default_value_t = 300, value_parser = whole(0..=100_000))]
     pub empty: usize,
     /// Campaigns with one effect of the library
-    #[arg(long, value_name = "N", default_value_t = 280)]
+    #[arg(long, value_name = "N", default_value_t = 280, value_parser = whole(0..=100_000))]
     pub single: usize,
     /// Campaigns with two
-    #[arg(long, value_name = "N", default_value_t = 48)]
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = whole(0..=100_000))]
     pub pair: usize,
     /// Campaigns with an effect that the library does not hold
-    #[arg(long, value_name = "N", default_value_t = 8 * UnmodelledKind::ALL.len())]
+    #[arg(long, value_name = "N", default_value_t = 8 * UnmodelledKind::ALL.len(), value_parser = whole(0..=100_000))]
     pub unknown: usize,
     /// One line a campaign; campaigns already in the file are not run again
     #[arg(long, value_name = "FILE.jsonl", default_value = "target/validate.jsonl")]
@@ -758,13 +761,13 @@ pub struct Validate {
 #[derive(Debug, Clone, Copy, Args)]
 pub struct Sampling {
     /// NUTS: independent chains
-    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u16).range(1..=256))]
     pub chains: u16,
     /// NUTS: draws of each chain that adapt the step
-    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(50..))]
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(50..=1_000_000))]
     pub warm_up: u32,
     /// NUTS: draws of each chain that are kept
-    #[arg(long, value_name = "N", default_value_t = 2000, value_parser = clap::value_parser!(u32).range(4..))]
+    #[arg(long, value_name = "N", default_value_t = 2000, value_parser = clap::value_parser!(u32).range(4..=1_000_000))]
     pub draws: u32,
     /// Fixes every random choice
     #[arg(long, default_value_t = 1)]
@@ -799,7 +802,7 @@ pub enum SurrogateAction {
         #[allow(missing_docs)] // flattened options carry their own docs
         common: Common,
         /// Number of points
-        #[arg(long, default_value_t = 2000)]
+        #[arg(long, default_value_t = 2000, value_parser = whole(1..=1_000_000))]
         samples: usize,
         /// Seed of the scrambled sequence
         #[arg(long, default_value_t = 1)]
@@ -823,10 +826,10 @@ pub struct Train {
     #[arg(long, value_name = "FILE.svg")]
     pub curves: Option<PathBuf>,
     /// Machines of the training set, in thousands; each is seen once, with all 48 correctors
-    #[arg(long, default_value_t = 520, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 520, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub machines: u32,
     /// Machines that are learnt with rounded weights after that, in thousands
-    #[arg(long, default_value_t = 90, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 90, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub rounded: u32,
     /// Seed of everything random
     #[arg(long, default_value_t = 18)]
@@ -920,18 +923,28 @@ fn moment(text: &str) -> Result<u64, String> {
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {
-    positive(text).map(Duration::from_secs_f64)
+    SECONDS.parse(text).map(Duration::from_secs_f64)
 }
 
-fn positive(text: &str) -> Result<f64, String> {
-    let wrong = || format!("expected a number above 0 and below 1e9, found {text:?}");
-    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v < 1e9).ok_or_else(wrong)
+/// A number of a range.
+fn number(range: limits::Range) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text: &str| range.parse(text)
 }
 
-fn width(text: &str) -> Result<f64, String> {
-    let wrong = || format!("expected a number above 0 and at most 1, found {text:?}");
-    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or_else(wrong)
+/// The same in single precision.
+fn single(range: limits::Range) -> impl Fn(&str) -> Result<f32, String> + Clone {
+    move |text: &str| range.parse(text).map(|number| number as f32)
 }
+
+/// A whole number of a range.
+fn whole(range: RangeInclusive<u64>) -> impl TypedValueParser<Value = usize> {
+    clap::value_parser!(u64).range(range).map(|number| number as usize)
+}
+
+/// Random walks of a var, per root of a cycle.
+const VAR_WALKS: limits::Range = limits::Range::new(0.0, 0.1, "");
+/// Random walks of a baseline, per root of a cycle.
+const BASELINE_WALKS: limits::Range = limits::Range::new(0.0, 1000.0, "um");
 
 fn range(text: &str) -> Result<Range, String> {
     let wrong = || format!("expected LOW,HIGH with 0.1 <= LOW < 1 < HIGH <= 10, found {text:?}");
@@ -941,21 +954,12 @@ fn range(text: &str) -> Result<Range, String> {
     bounds.filter(is_range).map(|(low, high)| [low, high]).ok_or_else(wrong)
 }
 
-fn walk(text: &str) -> Result<f32, String> {
-    let wrong = || format!("expected a number from 0 to 0.1, found {text:?}");
-    text.parse().ok().filter(|v: &f32| (0.0..=0.1).contains(v)).ok_or_else(wrong)
-}
-
 fn counts(text: &str) -> Result<Counts, String> {
-    let wrong = || format!("expected two whole numbers such as 122,122, found {text:?}");
+    let wrong = || format!("expected two whole numbers up to {} such as 122,122, found {text:?}", ELEMENTS.most);
     let all: Vec<usize> =
         text.split(',').map(|one| one.trim().parse()).collect::<Result<_, _>>().map_err(|_| wrong())?;
-    all.try_into().map_err(|_| wrong())
-}
-
-fn baseline_walk(text: &str) -> Result<f32, String> {
-    let wrong = || format!("expected a number of um from 0 to 1000, found {text:?}");
-    text.parse().ok().filter(|v: &f32| (0.0..=1000.0).contains(v)).ok_or_else(wrong)
+    let is_few = |counts: &Counts| counts.iter().all(|count| *count as u64 <= ELEMENTS.most);
+    all.try_into().ok().filter(is_few).ok_or_else(wrong)
 }
 
 #[cfg(test)]

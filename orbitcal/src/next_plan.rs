@@ -1,6 +1,5 @@
 //! The measurement that a diagnosis proposes, as a plan that `orbitcal measure` carries out: the plan at hand with what is changed.
 
-use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -9,6 +8,7 @@ use diagnosis::{Change, Proposal};
 use inference::recording::Names;
 use toml::{Table, Value};
 use twin::Ring;
+use twin::limits::SETTINGS;
 
 /// Why there is no next plan.
 #[derive(Debug, thiserror::Error)]
@@ -33,7 +33,7 @@ pub enum NextPlanError {
 pub fn write<'p>(now: &Path, to: &Path, ring: &Ring, proposals: &'p [Proposal]) -> Result<&'p str, NextPlanError> {
     let wrong = |why: &dyn core::fmt::Display| NextPlanError::Plan(now.into(), why.to_string());
     Plan::read(now, ring).map_err(|error| wrong(&error))?;
-    let text = fs::read_to_string(now).map_err(|error| wrong(&error))?;
+    let text = SETTINGS.text(now).map_err(|error| wrong(&error))?;
     let table: Table = text.parse().map_err(|error| wrong(&error))?;
     let folder = now.parent().unwrap_or(Path::new("")).join(table["header"].as_str().unwrap_or_default());
     let header = folder.canonicalize().map_err(|error| wrong(&error))?;
@@ -96,6 +96,8 @@ fn put(to: &Path, text: &str, ring: &Ring) -> std::io::Result<bool> {
 #[cfg(test)]
 mod tests {
     use control::Step;
+
+    use std::fs;
 
     use super::*;
 

@@ -125,6 +125,8 @@ mod tests {
     use results::EstimateRecord;
     use shared_memory::Publisher;
 
+    use std::sync::mpsc::RecvTimeoutError;
+
     use super::*;
 
     fn tally(stamps: &[(u64, u32)]) -> WatchSummary {
@@ -154,18 +156,23 @@ mod tests {
             idle: Some(Duration::from_secs(20)),
             quiet: true,
         };
-        let service = options.service.clone();
+        let (service, (end, ended)) = (options.service.clone(), std::sync::mpsc::channel::<()>());
         let writer = std::thread::spawn(move || {
             let record = |frames| EstimateRecord { sequence: frames, frames, ..EstimateRecord::example(20, 10) };
             let mut publisher = Publisher::try_new(&service, "a test", &record(1).names).unwrap();
             for frames in [1, 2, 4, 5] {
                 publisher.publish(&record(frames)).unwrap();
             }
-            std::thread::sleep(Duration::from_millis(300)); // history is handed over with the next estimate
-            publisher.publish(&record(6)).unwrap();
-            std::thread::sleep(Duration::from_millis(300));
+            // history is handed over with the next estimate, however late somebody looks on
+            for frames in 6.. {
+                if ended.recv_timeout(Duration::from_millis(50)) != Err(RecvTimeoutError::Timeout) {
+                    return;
+                }
+                publisher.publish(&record(frames)).unwrap();
+            }
         });
         let summary = watch(&options).unwrap();
+        end.send(()).unwrap();
         writer.join().unwrap();
         assert_eq!(summary, WatchSummary { seen: 3, lost: 1, restarts: 0 });
         let text = std::fs::read_to_string(options.trace.unwrap()).unwrap();

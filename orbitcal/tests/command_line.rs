@@ -1,8 +1,16 @@
 //! What a user meets at the command line: what is said, where, and with which exit status.
 
+use core::time::Duration;
+use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
+use std::time::Instant;
+
+use shared_memory::Subscriber;
+
+/// Longest wait for anything.
+const SOON: Duration = Duration::from_secs(60);
 
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
 
@@ -161,7 +169,12 @@ fn what_cannot_be_published_is_a_line_and_not_the_end() {
     let name = service("full");
     let arguments = ["replay", RECORDING, "--service", &name, "--rate", "1", "--quiet"];
     let mut busy: Vec<_> = (0..4).map(|_| command(&arguments).spawn().unwrap()).collect();
-    std::thread::sleep(core::time::Duration::from_secs(3));
+    let (mut subscriber, mut publishers, start) =
+        (Subscriber::try_new(&name).unwrap(), BTreeSet::new(), Instant::now());
+    while publishers.len() < busy.len() {
+        assert!(start.elapsed() < SOON, "{} publishers of {}", publishers.len(), busy.len());
+        publishers.extend(subscriber.wait(Duration::from_secs(1)).unwrap().iter().map(|each| each.stamp.started_ns));
+    }
     let output = orbitcal(&["replay", RECORDING, "--service", &name]);
     for one in &mut busy {
         one.kill().unwrap();

@@ -277,10 +277,19 @@ fn a_silent_device_does_not_hold_up_a_signal() {
     let mut serving = command.args(serve).stderr(Stdio::null()).spawn().unwrap();
     hears.recv().unwrap();
     // the handler is installed after the request, with the first look for a signal
-    thread::sleep(Duration::from_millis(500));
+    while !catches_sigterm(serving.id()) {
+        thread::sleep(Duration::from_millis(5));
+    }
     assert!(Command::new("kill").arg(serving.id().to_string()).status().unwrap().success());
     assert_eq!(serving.wait().unwrap().code(), Some(0));
     assert_eq!(std::fs::read_to_string(trace).unwrap().lines().count(), 1, "the header");
+}
+
+/// Whether a process has a handler for signal 15.
+fn catches_sigterm(process: u32) -> bool {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).unwrap();
+    let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).unwrap();
+    u64::from_str_radix(caught.trim(), 16).unwrap() & (1 << 14) != 0
 }
 
 #[test]

@@ -139,8 +139,8 @@ class FitResult(_Result):
     model: str
     vars: list[Var]
     monitors: list[Monitor]
-    chi2_per_dof: float | None
-    tunes: tuple[float, float] | None
+    chi2_per_dof: float | None = None
+    tunes: tuple[float, float] | None = None
     tunes_measured: dict[str, Any] | None = None
     mismatch: bool = False
     lack: str | None = None

@@ -70,7 +70,9 @@ struct Noise {
 
 #[derive(Debug, Serialize)]
 struct PlaneNoise {
+    #[serde(skip_serializing_if = "Option::is_none")]
     of_repeats_mm: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     of_header_mm: Option<f64>,
 }
 

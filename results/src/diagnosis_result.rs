@@ -35,6 +35,7 @@ pub struct DiagnosisResult {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     beyond_range: Vec<BeyondResult>,
     /// Of the machine that was found.
+    #[serde(skip_serializing_if = "Option::is_none")]
     tunes: Option<Tunes>,
     tunes_measured: TunesMeasured,
     next_measurement: Option<String>,
@@ -63,6 +64,7 @@ impl From<&OutOfRange> for BeyondResult {
 struct FindingResult {
     kind: &'static str,
     at: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
     s_m: Option<f64>,
     /// 95 % credible stretches of the place of a gradient.
     #[serde(skip_serializing_if = "Vec::is_empty")]

@@ -3,7 +3,7 @@
 use core::ops::ControlFlow;
 use std::sync::Arc;
 
-use inference::nuts::{self, NutsRun, NutsSettings};
+use inference::nuts::{self, NutsError, NutsRun, NutsSettings};
 use inference::{BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use report::Page;
 use twin::Ring;
@@ -90,7 +90,10 @@ pub fn fit_by_draws(
     let names = ring.var_names();
     let posterior = Arc::new(posterior);
     let run = nuts::sample(posterior.clone(), Arc::new(laplace), &names, settings, progress);
-    let run = run.map_err(|e| failed(e.to_string()))?;
+    let run = run.map_err(|error| match error {
+        NutsError::TooMany(_) => CommandError::Input(error.to_string()),
+        _ => failed(error.to_string()),
+    })?;
     let result = FitResult::of_draws(&reduced, word, &run);
     let extrapolated = is_network.then(|| outside(&posterior, &run));
     Ok((FitResult { notes: notes(&run), extrapolated, ..result }, run.draws))

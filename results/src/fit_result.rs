@@ -39,10 +39,12 @@ pub struct FitResult {
     pub vars: Vec<Var>,
     pub covariance: Vec<Vec<f64>>,
     /// None without degrees of freedom.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub chi2_per_dof: Option<f64>,
     /// The alarm: readings are further off than noise explains.
     pub mismatch: bool,
     /// The model's.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub tunes: Option<Tunes>,
     pub tunes_measured: TunesMeasured,
     /// What the recording lacks to say anything: the vars are then those of the prior, but for measured tunes.

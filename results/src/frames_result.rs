@@ -42,8 +42,9 @@ pub struct Strength {
 pub struct PlaneNoise {
     /// Of one orbit, with what the model misses.
     pub sigma_um: f64,
-    /// What the orbit drifts from one pair of frames to the next.
-    pub drift_um: f64,
+    /// What the orbit drifts from one pair of frames to the next; none where no monitor read two of them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub drift_um: Option<f64>,
 }
 
 impl Written {
@@ -56,7 +57,7 @@ impl Written {
             let rows: Vec<usize> = of_plane.map(|one| one.row).collect();
             PlaneNoise {
                 sigma_um: 1e3 * sigma.get(sigma.len() / 2).copied().unwrap_or(0.0),
-                drift_um: 1e3 * raw.drift(&rows),
+                drift_um: raw.drift(&rows).map(|drift| 1e3 * drift),
             }
         };
         Self {
@@ -91,15 +92,20 @@ impl Written {
 impl fmt::Display for Written {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { folder, frames, monitors, correctors, params, x, y, missing_um, .. } = self;
+        let drift = |plane: &PlaneNoise| plane.drift_um.map_or("an unknown length".into(), |um| format!("{um:.1} um"));
         let text = format!(
             "{frames} frames of {monitors} readings and {correctors} correctors, {params} params. One reading: {:.1} um in x, {:.1} um in y \
-             with what the model misses. The orbit drifts by {:.1} and {:.1} um from one pair of frames to the next. The core's model is off the \
+             with what the model misses. The orbit drifts by {} and {} from one pair of frames to the next. The core's model is off the \
              fitted ring by {missing_um:.2} um rms.",
-            x.sigma_um, y.sigma_um, x.drift_um, y.drift_um
+            x.sigma_um,
+            y.sigma_um,
+            drift(x),
+            drift(y)
         );
         writeln!(f, "{}\n", fill(&text))?;
         // a pair is two frames; where one plane drifts more its monitors are noisier too
-        let walk = x.drift_um.min(y.drift_um) / 2f64.sqrt();
+        let drifts = [x.drift_um, y.drift_um].into_iter().flatten();
+        let walk = drifts.reduce(f64::min).unwrap_or(0.0) / 2f64.sqrt();
         write!(
             f,
             "orbitcal replay {folder} --machine {folder}/machine.json --model-file {folder}/model --baseline-walk {walk:.1}"

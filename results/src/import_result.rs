@@ -16,9 +16,9 @@ pub struct Imported {
     pub file: String,
     pub format: String,
     pub circumference_m: f64,
-    #[serde(rename = "energy_GeV")]
+    #[serde(rename = "energy_GeV", skip_serializing_if = "Option::is_none")]
     pub energy: Option<f64>,
-    #[serde(rename = "rf_Hz")]
+    #[serde(rename = "rf_Hz", skip_serializing_if = "Option::is_none")]
     pub rf: Option<f64>,
     /// Of the twin of the lattice.
     pub tunes: [f64; 2],

@@ -24,6 +24,7 @@ mod compare;
 mod diagnosis_page;
 mod diagnosis_result;
 mod error;
+mod finite;
 mod fit;
 mod fit_page;
 mod fit_result;

@@ -31,6 +31,7 @@ pub struct MatrixFit {
     /// With the stated noise alone, at the values that make it least.
     pub chi2_loco: f64,
     pub chi2_loco_start: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub tunes: Option<Tunes>,
     pub monitors: Vec<Monitor>,
     pub other: Vec<Other>,
@@ -84,6 +85,7 @@ pub struct BlockError {
     /// What the model misses, beside the stated noise: scale of Student's distribution.
     pub scale_um: f64,
     /// Its degrees of freedom, none where it is normal.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub freedom: Option<f64>,
 }
 

@@ -11,6 +11,7 @@ use training::green::{Difference, difference};
 use training::rooms::large::{PACKET, Request};
 use training::{AnyParcel, LINE, Tables, TrainingError};
 use twin::Ring;
+use twin::limits::FILE;
 
 use crate::output::{self, OutputError};
 
@@ -121,7 +122,7 @@ fn wire(parcel: AnyParcel) -> Vec<u8> {
 pub fn read(path: &Path, ring: &Ring) -> Result<Tables, ModelFileError> {
     let machine = &ring.name;
     let name = || path.display().to_string();
-    let mut bytes = std::fs::read(path).map_err(|source| ModelFileError::Read { path: name(), source })?;
+    let mut bytes = FILE.bytes(path).map_err(|source| ModelFileError::Read { path: name(), source })?;
     let end = bytes.iter().position(|byte| *byte == b'\n').ok_or_else(|| ModelFileError::Kind { path: name() })?;
     let first = String::from_utf8_lossy(&bytes[..end]).into_owned();
     let found = first.strip_prefix(FIRST).ok_or_else(|| ModelFileError::Kind { path: name() })?;

@@ -8,6 +8,8 @@ use comfy_table::{ContentArrangement, Table, presets};
 use serde::Serialize;
 use tempfile::NamedTempFile;
 
+use crate::finite;
+
 /// Width of every table, that of a plain terminal.
 const COLUMNS: u16 = 80;
 
@@ -77,12 +79,12 @@ pub fn table<'h>(header: impl IntoIterator<Item = &'h str>) -> Table {
     table
 }
 
-/// Write JSON to a file, or to stdout for `-`.
+/// Write JSON to a file, or to stdout for `-`; a field whose number is not finite is absent, and the field `absent` names it.
 ///
 /// # Errors
 /// [`OutputError`]; a file of that name is then as it was.
 pub fn json(path: &Path, value: &impl Serialize) -> Result<(), OutputError> {
-    let text = serde_json::to_string_pretty(value).map_err(|e| OutputError::of(path, e))?;
+    let text = finite::text(value).map_err(|e| OutputError::of(path, e))?;
     if path == Path::new("-") { say(text) } else { bytes(path, (text + "\n").as_bytes()) }
 }
 

@@ -133,7 +133,7 @@ mod tests {
         let sent: Vec<Vec<u8>> = [3, 500, 5000, 7].map(|length| vec![length as u8; length]).to_vec();
         sent.iter().for_each(|frame| writer.send(frame).unwrap());
         let mut heard = Vec::new();
-        reader.wait(Duration::from_secs(5), |frame| heard.push(frame.to_vec())).unwrap();
+        reader.wait(Duration::from_secs(60), |frame| heard.push(frame.to_vec())).unwrap();
         assert_eq!(heard, sent);
         let second = FrameWriter::try_alone(&name, "a daemon").err().unwrap().to_string();
         assert!(second.contains("another daemon publishes there"), "{second}");

@@ -90,7 +90,7 @@ mod tests {
     use super::*;
     use crate::{Published, Subscriber};
 
-    const SOON: Duration = Duration::from_secs(5);
+    const SOON: Duration = Duration::from_secs(60);
 
     fn name(test: &str) -> String {
         format!("orbitcal/test/{}/{test}", std::process::id())
@@ -159,7 +159,7 @@ mod tests {
         let mut subscriber = Subscriber::try_new(&name("idle")).unwrap();
         let start = Instant::now();
         assert!(subscriber.wait(Duration::from_millis(30)).unwrap().is_empty());
-        assert!((30..3000).contains(&start.elapsed().as_millis()), "{:?}", start.elapsed());
+        assert!(start.elapsed() >= Duration::from_millis(30), "{:?}", start.elapsed());
     }
 
     #[test]

@@ -221,7 +221,7 @@ mod tests {
         drop(client);
         std::thread::scope(|scope| {
             let ask =
-                || RequestClient::try_new(&name).unwrap().ask(&Request::Snapshot, Duration::from_secs(10)).unwrap();
+                || RequestClient::try_new(&name).unwrap().ask(&Request::Snapshot, Duration::from_secs(60)).unwrap();
             let asked = scope.spawn(ask);
             let request = loop {
                 if let Some(request) = server.receive().unwrap() {

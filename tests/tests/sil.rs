@@ -363,7 +363,7 @@ fn the_log_is_decoded_and_a_fault_reported() {
     let emulator = Emulator::start(&image, &Options::default()).unwrap();
     let (_, recording) = read("paper-vars");
     Link::new(emulator.uart()).write(&wires(&recording)[0]).unwrap();
-    let run = emulator.wait(Duration::from_secs(20)).unwrap();
+    let run = emulator.wait(Duration::from_secs(120)).unwrap();
     let log = IMAGE.log(&run.stdout).unwrap();
     let messages: Vec<&str> = log.iter().map(|line| line.message.as_str()).collect();
     let pc = format!("pc {:#x}", step.address & !1);

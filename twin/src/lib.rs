@@ -15,6 +15,7 @@ mod calibrated;
 mod dispersion;
 mod effects;
 mod lattice;
+pub mod limits;
 mod map;
 mod matrix;
 mod modes;

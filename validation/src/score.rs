@@ -6,6 +6,7 @@ use std::path::Path;
 use diagnosis::{DECISIVE, Diagnosis, Finding, Term, Vars, Verdict};
 use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
+use twin::limits::{self, FILE};
 use twin::{EffectError, EffectKind, Ring};
 
 /// What a recording was made with.
@@ -113,9 +114,8 @@ impl Truth {
     pub fn read(folder: &Path, ring: &Ring) -> Result<Self, TruthError> {
         let path = folder.join("truth.json");
         let wrong = |what: String| TruthError { path: path.display().to_string(), what };
-        let text = std::fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;
-        let Key { effects, vars, oracle_gain } =
-            serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+        let text = FILE.text(&path).map_err(|error| wrong(error.to_string()))?;
+        let Key { effects, vars, oracle_gain } = limits::json(&text).map_err(|error| wrong(error.to_string()))?;
         let effects = effects.into_iter().map(|entry| entry.resolve(ring)).collect::<Result<_, _>>();
         Ok(Self { effects: effects.map_err(|error| wrong(error.to_string()))?, vars, oracle_gain })
     }

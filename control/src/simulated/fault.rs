@@ -4,6 +4,7 @@ use core::str::FromStr;
 
 use inference::recording::Names;
 use twin::Ring;
+use twin::limits::Range;
 
 /// Something that fails.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -33,7 +34,7 @@ pub enum Fault {
 
 /// A fault that there is none of.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("expected drop_out@MONITOR=SHARE, freeze@x=CYCLE or stick@CORRECTOR=CYCLE, found {0:?}")]
+#[error("expected drop_out@MONITOR=SHARE (0 to 1), freeze@x=CYCLE or stick@CORRECTOR=CYCLE, found {0:?}")]
 pub struct FaultError(String);
 
 impl Fault {
@@ -47,7 +48,7 @@ impl Fault {
             let (kind, rest) = text.split_once('@')?;
             let (place, value) = rest.split_once('=')?;
             match kind {
-                "drop_out" => Some(Self::DropOut { monitor: names.monitor(place)?, share: number(value)? }),
+                "drop_out" => Some(Self::DropOut { monitor: names.monitor(place)?, share: SHARE.parse(value).ok()? }),
                 "freeze" => {
                     let plane = ["x", "y"].iter().position(|plane| *plane == place)?;
                     Some(Self::Freeze { plane, from: number(value)? })
@@ -77,6 +78,9 @@ impl Fault {
         matches!(self, Self::Stick { corrector, from } if *corrector == of && cycle >= *from)
     }
 }
+
+/// Of all cycles.
+const SHARE: Range = Range::new(0.0, 1.0, "");
 
 fn number<T: FromStr>(text: &str) -> Option<T> {
     text.parse().ok()

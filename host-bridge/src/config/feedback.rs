@@ -1,12 +1,12 @@
 //! `[feedback]`: what is wanted of the orbit, and which correctors may be moved for it.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use inference::stream;
 use serde::Deserialize;
 use twin::Ring;
+use twin::limits::{self, FILE};
 
 /// `[feedback]`
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -83,8 +83,8 @@ impl Feedback {
 /// Wanted readings by the names of monitors [mm].
 fn orbit(file: &Path) -> Result<BTreeMap<String, f32>, String> {
     let said = |why: &dyn core::fmt::Display| format!("feedback.orbit_file: {}: {why}", file.display());
-    let text = fs::read_to_string(file).map_err(|error| said(&error))?;
-    let wanted: BTreeMap<String, f32> = serde_json::from_str(&text).map_err(|error| {
+    let text = FILE.text(file).map_err(|error| said(&error))?;
+    let wanted: BTreeMap<String, f32> = limits::json(&text).map_err(|error| {
         said(&format_args!("expected an object of readings in mm, such as {{\"x_C6\": 1.5}}: {error}"))
     })?;
     match wanted.iter().find(|(_, mm)| mm.abs() > 100.0) {
@@ -95,6 +95,8 @@ fn orbit(file: &Path) -> Result<BTreeMap<String, f32>, String> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn of(text: &str) -> Result<stream::Feedback, String> {

@@ -145,7 +145,7 @@ impl Outlet {
         if self.reporter.is_due() {
             self.publish_health();
         }
-        self.record(record);
+        self.record(record, frame.at);
         if let (Some(fitted), Some(readings)) = (fitted, readings) {
             let health = self.health(record, *fit);
             self.board.show(record, &health, &readings, fitted);
@@ -182,12 +182,12 @@ impl Outlet {
         }
     }
 
-    fn record(&mut self, record: &EstimateRecord) {
+    fn record(&mut self, record: &EstimateRecord, came: Instant) {
         let Some(history) = &mut self.history else { return };
-        if history.note(record)
+        if history.note(record, came)
             && let Some((last, fit)) = self.last
         {
-            history.record(record, &self.reporter.health.record(last, fit), now_ms());
+            history.record(record, &self.reporter.health.record(last, fit), came, now_ms());
         }
     }
 

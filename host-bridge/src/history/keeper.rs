@@ -25,6 +25,7 @@ const AGAIN: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub struct Recorder {
     every: Duration,
+    /// When the frame of the last row came.
     last: Option<Instant>,
     mismatch: bool,
     worst: Vec<State>,
@@ -38,10 +39,11 @@ impl Recorder {
         Self { every: plan.0[0].every, last: None, mismatch: false, worst, keeper }
     }
 
-    /// Note what must not be forgotten of a frame between two rows; true if a row is due.
-    pub fn note(&mut self, record: &EstimateRecord) -> bool {
+    /// Note what must not be forgotten of a frame between two rows; true if a row is due by when the frames came, however late they are
+    /// noted.
+    pub fn note(&mut self, record: &EstimateRecord, came: Instant) -> bool {
         self.mismatch |= record.mismatch == Some(true);
-        self.last.is_none_or(|last| last.elapsed() >= self.every)
+        self.last.is_none_or(|last| came.saturating_duration_since(last) >= self.every)
     }
 
     /// Note the states of all instruments, which have changed.
@@ -50,10 +52,10 @@ impl Recorder {
         self.worst.iter_mut().zip(states).for_each(|(worst, state)| *worst = worse(*worst, state));
     }
 
-    /// Hand on a row.
-    pub fn record(&mut self, record: &EstimateRecord, health: &HealthRecord, time_ms: u64) {
+    /// Hand on a row of a frame.
+    pub fn record(&mut self, record: &EstimateRecord, health: &HealthRecord, came: Instant, time_ms: u64) {
         self.note_states(health);
-        self.last = Some(Instant::now());
+        self.last = Some(came);
         self.keeper.offer(Row {
             time_ms,
             sequence: record.sequence,
@@ -250,13 +252,15 @@ mod tests {
         let lost = Arc::new(AtomicU64::new(0));
         let keeper = Keeper::start(folder.path(), &plan, &columns(), lost.clone()).unwrap();
         let mut recorder = Recorder::new(&plan, &columns(), keeper);
+        let start = Instant::now();
         let (right, wrong) =
             (EstimateRecord::example(2, 1), EstimateRecord { mismatch: Some(true), ..EstimateRecord::example(2, 1) });
         for (i, states) in [[State::Ok; 2], [State::Dead, State::Ok], [State::Ok, State::Back]].into_iter().enumerate()
         {
-            recorder.note(if i == 1 { &wrong } else { &right });
-            while !recorder.note(&right) {}
-            recorder.record(&EstimateRecord::example(2, 1), &health(states), 1_000_000 + i as u64);
+            let came = start + Duration::from_millis(i as u64);
+            assert_eq!(recorder.note(if i == 1 { &wrong } else { &right }, came - Duration::from_micros(1)), i == 0);
+            assert!(recorder.note(&right, came));
+            recorder.record(&EstimateRecord::example(2, 1), &health(states), came, 1_000_000 + i as u64);
         }
         recorder.finish();
         assert_eq!(lost.load(Ordering::Relaxed), 0);
@@ -275,7 +279,7 @@ mod tests {
         // started again within the minute: no further row of it
         let keeper = Keeper::start(folder.path(), &plan, &columns(), lost).unwrap();
         let mut recorder = Recorder::new(&plan, &columns(), keeper);
-        recorder.record(&EstimateRecord::example(2, 1), &health([Ok; 2]), 1_000_500);
+        recorder.record(&EstimateRecord::example(2, 1), &health([Ok; 2]), start, 1_000_500);
         recorder.finish();
         assert_eq!(["fine", "minutes", "hours"].map(rows), [4, 1, 1]);
     }
@@ -290,7 +294,8 @@ mod tests {
         let mut recorder = Recorder::new(&plan, &columns(), keeper);
         fs::remove_dir_all(&path).unwrap();
         fs::write(&path, "").unwrap();
-        (0..3).for_each(|i| recorder.record(&EstimateRecord::example(2, 1), &health([State::Ok; 2]), i));
+        (0..3)
+            .for_each(|i| recorder.record(&EstimateRecord::example(2, 1), &health([State::Ok; 2]), Instant::now(), i));
         recorder.finish();
         assert_eq!(lost.load(Ordering::Relaxed), 3);
     }

@@ -4,6 +4,8 @@ use core::fmt;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
+use twin::limits::Exceeded;
+
 /// Why a folder is not a recording of the machine; prints as one line.
 #[non_exhaustive]
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -12,8 +14,8 @@ pub enum RecordingError {
     #[error("{}: file not found", .0.display())]
     NotFound(PathBuf),
     /// The file is closed to us or not text.
-    #[error("{}: cannot be read as UTF-8 text: {}", .0.display(), .1)]
-    Unreadable(PathBuf, ErrorKind),
+    #[error("{}: {}", .0.display(), .1)]
+    Unreadable(PathBuf, String),
     /// The header is not TOML, lacks a key, has one too many, or a value cannot be; with what TOML expected and found.
     #[error("{0}: {1}")]
     Header(Place, String),
@@ -47,6 +49,9 @@ pub enum RecordingError {
     /// There is nothing below the line of columns.
     #[error("{0}")]
     NoFrames(Mismatch),
+    /// It holds more than fits.
+    #[error("{0}: {1}")]
+    TooLarge(Place, Exceeded),
     /// A file cannot be written.
     #[error("{}: cannot be written: {}", .0.display(), .1)]
     Unwritable(PathBuf, ErrorKind),
@@ -56,7 +61,7 @@ impl RecordingError {
     pub(super) fn reading(file: &Path, error: &std::io::Error) -> Self {
         match error.kind() {
             ErrorKind::NotFound => Self::NotFound(file.into()),
-            kind => Self::Unreadable(file.into(), kind),
+            _ => Self::Unreadable(file.into(), twin::unreadable(error)),
         }
     }
 }

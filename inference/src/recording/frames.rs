@@ -4,6 +4,7 @@
 use std::path::Path;
 
 use twin::Ring;
+use twin::limits::{Budget, MEMORY};
 
 use super::columns::Columns;
 use super::error::{Part, Place, RecordingError};
@@ -16,6 +17,10 @@ use super::names::Names;
 /// Share of a frame's readings, and their number at least, that are alike without a beam: some monitors are stuck at another number.
 const NEARLY: f64 = 0.8;
 const FEWEST: usize = 4;
+
+/// What a row, and a cell of it, take in memory [B].
+const ROW: u64 = size_of::<Row>() as u64;
+const CELL: u64 = size_of::<Option<f64>>() as u64;
 
 /// One machine cycle.
 #[derive(Debug, Clone, PartialEq)]
@@ -76,8 +81,12 @@ pub(super) fn parse(
     let mut lines = text.lines();
     let columns = Columns::parse(file, lines.next().unwrap_or_default(), header, ring, names)?;
     let mut rows: Vec<Row> = Vec::new();
+    let memory = Budget::new(MEMORY);
     for (index, line) in lines.enumerate() {
         let cells = Cells::split(file, 2 + index, &columns, line)?;
+        memory
+            .take(ROW + CELL * cells.cells.len() as u64)
+            .map_err(|exceeded| RecordingError::TooLarge(Place::new(file, 2 + index, Part::Whole), exceeded))?;
         let row = cells.row(header, names, rows.last())?;
         rows.push(row);
     }

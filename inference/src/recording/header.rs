@@ -11,6 +11,7 @@ use std::path::Path;
 
 use serde::de::{Error as _, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
+use twin::limits::SETTINGS;
 use twin::{Effect, EffectError, EffectKind, Holding, Rf, Ring};
 
 use super::error::{Part, Place, RecordingError};
@@ -147,7 +148,7 @@ impl Header {
     /// # Errors
     /// [`RecordingError`], the first fault met.
     pub fn read(file: &Path, ring: &Ring) -> Result<Self, RecordingError> {
-        let text = super::text(file)?;
+        let text = super::text(file, SETTINGS)?;
         let ring = super::powered(ring, format(file, &text)?);
         Self::parse(file, &text, &ring, &Names::from_ring(&ring))
     }

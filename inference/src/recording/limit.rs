@@ -1,14 +1,19 @@
 //! What a number of a recording may be.
 
+use twin::limits;
+
 /// What a number may be, in words and as a check of finite values.
 pub(super) struct Limit {
     pub words: &'static str,
     accepts: fn(f64) -> bool,
 }
 
-pub(super) const FINITE: Limit = Limit { words: "a finite number", accepts: |_| true };
-pub(super) const POSITIVE: Limit = Limit { words: "a positive finite number", accepts: |x| x > 0.0 };
-pub(super) const NOT_NEGATIVE: Limit = Limit { words: "a finite number from 0", accepts: |x| x >= 0.0 };
+pub(super) const FINITE: Limit =
+    Limit { words: "a number from -1e15 to 1e15", accepts: |x| limits::FINITE.check(x).is_ok() };
+pub(super) const POSITIVE: Limit =
+    Limit { words: "a number from 1e-15 to 1e15", accepts: |x| limits::POSITIVE.check(x).is_ok() };
+pub(super) const NOT_NEGATIVE: Limit =
+    Limit { words: "a number from 0 to 1e15", accepts: |x| limits::NOT_NEGATIVE.check(x).is_ok() };
 pub(super) const NO_SETTING: Limit = Limit { words: "0, as no corrector is named", accepts: |x| x == 0.0 };
 pub(super) const POSITION: Limit = Limit { words: "a position from -100 to 100 mm", accepts: |x| x.abs() <= 100.0 };
 pub(super) const RF_OFFSET: Limit =
@@ -40,6 +45,12 @@ pub(super) fn in_milli(value: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_words_are_those_of_the_ranges() {
+        let ranges = [limits::FINITE, limits::POSITIVE, limits::NOT_NEGATIVE].map(|range| range.to_string());
+        assert_eq!([FINITE, POSITIVE, NOT_NEGATIVE].map(|limit| limit.words), ranges);
+    }
 
     #[test]
     fn decimal_millimetres_stay_correct_to_one_ulp() {

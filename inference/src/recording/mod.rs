@@ -15,10 +15,10 @@ mod ramp;
 mod write;
 
 use std::borrow::Cow;
-use std::fs;
 use std::path::Path;
 
 use twin::Ring;
+use twin::limits::{FILE, Limit, SETTINGS};
 
 pub use drive::Drive;
 pub(crate) use drive::{field, mean, mean_supplies};
@@ -51,8 +51,8 @@ impl Recording {
     /// # Errors
     /// The first fault met, the header's before the frames'; last what of the header the frames contradict.
     pub fn read(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
-        let header = text(&folder.join(HEADER))?;
-        Self::of_texts(folder, ring, &header, || text(&folder.join(FRAMES)))
+        let header = text(&folder.join(HEADER), SETTINGS)?;
+        Self::of_texts(folder, ring, &header, || text(&folder.join(FRAMES), FILE))
     }
 
     /// The same from the texts of the two files; `folder` gives the recording its name and appears in errors.
@@ -86,7 +86,7 @@ impl Recording {
     /// # Errors
     /// As [`Recording::read`].
     pub fn read_at_its_energy(folder: &Path, ring: &Ring) -> Result<Self, RecordingError> {
-        Self::read(folder, &at_its_energy(ring, &text(&folder.join(HEADER))?))
+        Self::read(folder, &at_its_energy(ring, &text(&folder.join(HEADER), SETTINGS)?))
     }
 
     /// The same from the texts of the two files, as [`Recording::parse`].
@@ -160,8 +160,8 @@ fn name(folder: &Path) -> String {
 }
 
 /// The file's text without the byte order mark that some spreadsheets put before it.
-fn text(file: &Path) -> Result<String, RecordingError> {
-    let text = fs::read_to_string(file).map_err(|error| RecordingError::reading(file, &error))?;
+fn text(file: &Path, limit: Limit) -> Result<String, RecordingError> {
+    let text = limit.text(file).map_err(|error| RecordingError::reading(file, &error))?;
     Ok(text.strip_prefix('\u{feff}').map(str::to_owned).unwrap_or(text))
 }
 

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use serde::Deserialize;
-use twin::{EffectText, Kind, Ring};
-
+use twin::limits;
 use twin::unreadable;
+use twin::{EffectText, Kind, Ring};
 
 /// Probability from which a finding is part of the machine; below, it is a remark. That of the verdict `identified`.
 const DECISIVE: f64 = 0.95;
@@ -137,8 +137,7 @@ impl Calibration {
     /// [`CalibrationError`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
         let shown = path.display().to_string();
-        let text =
-            std::fs::read_to_string(path).map_err(|source| CalibrationError::Read { path: shown.clone(), source })?;
+        let text = limits::FILE.text(path).map_err(|source| CalibrationError::Read { path: shown.clone(), source })?;
         Self::parse(&text, &shown)
     }
 
@@ -148,7 +147,7 @@ impl Calibration {
     /// [`CalibrationError`].
     pub fn parse(text: &str, path: &str) -> Result<Self, CalibrationError> {
         let file: ResultFile =
-            serde_json::from_str(text).map_err(|source| CalibrationError::Syntax { path: path.into(), source })?;
+            limits::json(text).map_err(|source| CalibrationError::Syntax { path: path.into(), source })?;
         let vars = file.vars.or(file.vars_after).ok_or_else(|| CalibrationError::NoVars { path: path.into() })?;
         if let Some(wrong) = vars.iter().find(|var| var.mean <= 0.0) {
             return Err(CalibrationError::Strength { path: path.into(), name: wrong.name.clone(), mean: wrong.mean });

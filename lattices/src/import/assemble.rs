@@ -103,9 +103,9 @@ pub(super) fn empty(lattice: &Lattice, instruments: &Instruments, rf: Option<f64
         return lattice.refuse("no cavity with a frequency; state the RF frequency with --rf-frequency HZ".into());
     };
     let mut rows = Vec::new();
-    for (element, one) in lattice.elements.iter().enumerate() {
+    for (one, is_cut) in lattice.elements.iter().zip(cuts(lattice, instruments)) {
         let s = rows.last().map_or(0.0, |last: &Row| last.s + last.length);
-        rows.extend(pieces(one, s, is_cut(instruments, element, one)));
+        rows.extend(pieces(one, s, is_cut));
     }
     let meta = Meta {
         circumference,
@@ -126,11 +126,15 @@ pub(super) fn empty(lattice: &Lattice, instruments: &Instruments, rf: Option<f64
     })
 }
 
-/// A monitor with a length, or a corrector in a field.
-fn is_cut(instruments: &Instruments, element: usize, one: &Element) -> bool {
-    let is = |all: &[super::Instrument]| all.iter().any(|own| own.element == element);
-    let has_field = one.bend != 0.0 || one.k1 != 0.0;
-    one.length > 0.0 && (is(&instruments.monitors) || has_field && is(&instruments.correctors))
+/// Which elements are cut: a monitor with a length, or a corrector in a field.
+fn cuts(lattice: &Lattice, instruments: &Instruments) -> Vec<bool> {
+    let mut cuts = vec![false; lattice.elements.len()];
+    instruments.monitors.iter().for_each(|one| cuts[one.element] = lattice.elements[one.element].length > 0.0);
+    for corrector in &instruments.correctors {
+        let one = &lattice.elements[corrector.element];
+        cuts[corrector.element] |= one.length > 0.0 && (one.bend != 0.0 || one.k1 != 0.0);
+    }
+    cuts
 }
 
 /// The row of an element whose entrance is at `s`, or its halves with a row of no length between.
@@ -169,8 +173,8 @@ fn pieces(one: &Element, s: f64, is_cut: bool) -> Vec<Row> {
 /// Row of the folder where each element acts: the row of no length, where it is cut.
 pub(super) fn places(lattice: &Lattice, instruments: &Instruments) -> Vec<usize> {
     let mut next = 0;
-    let places = lattice.elements.iter().enumerate().map(|(element, one)| {
-        let cut = usize::from(is_cut(instruments, element, one));
+    let places = cuts(lattice, instruments).into_iter().map(|is_cut| {
+        let cut = usize::from(is_cut);
         next += 1 + 2 * cut;
         next - 1 - cut
     });

@@ -11,6 +11,7 @@ use super::element::{Element, Format, Lattice, Role};
 use super::fields::{DISPLACED, Fields, KICKS, NONE, ROLLED, Strengths, give};
 use measured::MeasuredError;
 use measured::folder::Particle;
+use twin::limits::ELEMENTS;
 
 /// More periods than any ring has.
 const MOST_PERIODS: f64 = 1_000.0;
@@ -51,6 +52,9 @@ pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> 
     if !(1.0..=MOST_PERIODS).contains(&periods) {
         return lattice.refuse(format!("periodicity: expected 1 to {MOST_PERIODS}, found {periods}"));
     }
+    if let Err(exceeded) = ELEMENTS.check(elements.len() as u64 * periods as u64) {
+        return lattice.refuse(format!("{} elements x periodicity {periods}: {exceeded}", elements.len()));
+    }
     for _ in 0..periods as usize {
         for (index, value) in elements.iter().enumerate() {
             let name = value.get("FamName").and_then(Value::as_str).map_or(format!("#{index}"), str::to_owned);
@@ -85,8 +89,7 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
     };
     if class == "RFCavity" {
         lattice.rf = lattice.rf.or(fields.maybe("Frequency")?);
-        lattice.elements.push(one);
-        return Ok(());
+        return lattice.push(one);
     }
     displaced(lattice, &one, fields);
     let pass = fields.value.get("PassMethod").and_then(Value::as_str).unwrap_or_default();
@@ -102,8 +105,7 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
         if is_off && fields.number("BendingAngle")? != 0.0 {
             return Err(fields.wrong(format!("pass method {pass} of a dipole, whose angle the reference orbit needs")));
         }
-        lattice.elements.push(one);
-        return Ok(());
+        return lattice.push(one);
     }
     Err(fields.wrong(format!("class {class} acts on the orbit and is not known here")))
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use twin::Plane;
+use twin::limits::POSITIVE;
 
 use super::instruments::{Channel, Instrument, Order, label};
 use super::table::Table;
@@ -101,11 +102,11 @@ impl PerInstrument {
             },
         };
         let numbers = channels.iter().map(|channel| match one(channel)? {
-            number if number.is_finite() && number != 0.0 => Ok(number),
+            number if POSITIVE.check(number.abs()).is_ok() => Ok(number),
             number => {
                 let name = label(*channel, names);
                 Err(MeasuredError::Convention(format!(
-                    "{option} of {name}: expected a number other than 0, found {number}"
+                    "{option} of {name}: expected {POSITIVE} or the negative of one, found {number:e}"
                 )))
             }
         });

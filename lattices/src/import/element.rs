@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 
 use measured::MeasuredError;
 use measured::folder::Particle;
+use twin::limits::ELEMENTS;
 
 /// Angles of dipoles in files are rounded, and are those of measured fields; all of them make a turn within this share.
 const ROUNDING: f64 = 0.01;
@@ -162,6 +163,15 @@ impl Lattice {
             Some(self.harmonic? * LIGHT * (1.0 - gamma.powi(-2)).sqrt() / self.circumference())
         };
         self.rf.or_else(by_harmonic)
+    }
+
+    /// Add an element.
+    pub(super) fn push(&mut self, one: Element) -> Result<(), MeasuredError> {
+        if let Err(exceeded) = ELEMENTS.check(self.elements.len() as u64 + 1) {
+            return self.refuse(exceeded.to_string());
+        }
+        self.elements.push(one);
+        Ok(())
     }
 
     /// Count a field that is left out.

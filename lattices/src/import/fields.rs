@@ -6,6 +6,7 @@ use serde_json::Value;
 
 use super::element::{Element, Lattice};
 use measured::MeasuredError;
+use twin::limits::FINITE;
 
 /// Below this a stray number is rounding, and no field.
 pub(super) const NONE: f64 = 1e-12;
@@ -75,8 +76,10 @@ impl<'a> Fields<'a> {
     }
 
     fn finite(&self, key: &str, value: &Value) -> Result<f64, MeasuredError> {
-        let number = value.as_f64().filter(|number| number.is_finite());
-        number.ok_or_else(|| self.wrong(format!("{key}: expected a finite number, found {value}")))
+        match value.as_f64() {
+            Some(number) => FINITE.check(number).map_err(|problem| self.wrong(format!("{key}: {problem}"))),
+            None => Err(self.wrong(format!("{key}: expected {FINITE}, found {value}"))),
+        }
     }
 
     /// A problem of this element.
@@ -136,6 +139,5 @@ pub(super) fn give(lattice: &mut Lattice, mut element: Element, of: Strengths) -
     if of.is_higher {
         lattice.leave_out("octupole or higher field (none to first order on the reference orbit)");
     }
-    lattice.elements.push(element);
-    Ok(())
+    lattice.push(element)
 }

@@ -4,9 +4,10 @@ use hdf5_pure::{Dataset, File, Group};
 
 use super::source::Source;
 use measured::MeasuredError;
+use twin::limits::{Budget, MEMORY};
 
-/// Numbers of a dataset at most.
-const LARGEST: u64 = 1 << 27;
+/// What a number of a matrix takes in all datasets together, and in a table after that [B].
+const NUMBER: u64 = 3 * size_of::<f64>() as u64;
 
 /// A matrix by its lines.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,11 +34,12 @@ pub(super) fn matrix(source: &Source, bytes: Vec<u8>) -> Result<Matrix, Measured
     let have = || {
         let mut found = Vec::new();
         list(&file.root(), "", &mut found);
-        found.iter().take(12).cloned().collect::<Vec<_>>().join(", ")
+        found.join(", ")
     };
     let Some(path) = &source.name else {
         return Err(refused(format!("name a dataset, {name}:PATH; it has {}", have())));
     };
+    let memory = Budget::new(MEMORY);
     let mut matrix = Matrix { width: 0, values: Vec::new() };
     for path in path.split(',') {
         let dataset =
@@ -55,7 +57,9 @@ pub(super) fn matrix(source: &Source, bytes: Vec<u8>) -> Result<Matrix, Measured
             return Err(refused(problem));
         }
         matrix.width = width;
-        matrix.values.extend(numbers(&dataset).map_err(|problem| refused(format!("{path}: {problem}")))?);
+        matrix
+            .values
+            .extend(numbers(&dataset, &memory, NUMBER).map_err(|problem| refused(format!("{path}: {problem}")))?);
     }
     Ok(matrix)
 }
@@ -63,17 +67,31 @@ pub(super) fn matrix(source: &Source, bytes: Vec<u8>) -> Result<Matrix, Measured
 /// Dimensions; the last runs fastest.
 pub(super) fn shape(dataset: &Dataset) -> Result<Vec<usize>, String> {
     let shape = dataset.shape().map_err(|error| error.to_string())?;
-    match shape.iter().try_fold(1_u64, |all, one| all.checked_mul(*one)) {
-        Some(count) if count <= LARGEST => Ok(shape.into_iter().map(|one| one as usize).collect()),
-        _ => Err(format!("dimensions {shape:?}, of more than {LARGEST} numbers")),
+    match count(&shape) {
+        u64::MAX => Err(format!("dimensions {shape:?}, whose product cannot be counted")),
+        _ => Ok(shape.into_iter().map(|one| one as usize).collect()),
     }
 }
 
-/// All numbers of a dataset.
-pub(super) fn numbers(dataset: &Dataset) -> Result<Vec<f64>, String> {
-    let count: usize = shape(dataset)?.iter().product();
+fn count(shape: &[u64]) -> u64 {
+    shape.iter().fold(1, |all, one| all.saturating_mul(*one))
+}
+
+/// Take the memory of a dataset, `each` an element and a chunk as it is stored: a file states both without having them.
+pub(super) fn take(dataset: &Dataset, memory: &Budget, each: u64) -> Result<(), String> {
+    let said = |error: hdf5_pure::Error| error.to_string();
+    let stored = dataset.element_size().map_err(said)?;
+    let chunk = dataset.chunk_shape().map_err(said)?.map_or(0, |chunk| count(&chunk));
+    let all = count(&dataset.shape().map_err(said)?).saturating_mul(each + stored);
+    memory.take(all.saturating_add(chunk.saturating_mul(stored))).map_err(|exceeded| exceeded.to_string())
+}
+
+/// All numbers of a dataset, which take `each` bytes of memory.
+pub(super) fn numbers(dataset: &Dataset, memory: &Budget, each: u64) -> Result<Vec<f64>, String> {
+    let count = count(&dataset.shape().map_err(|error| error.to_string())?);
+    take(dataset, memory, each)?;
     let values = dataset.read_f64().map_err(|error| format!("expected numbers, found {} ({error})", words(dataset)))?;
-    match values.len() {
+    match values.len() as u64 {
         found if found == count => Ok(values),
         found => Err(format!("{count} numbers by its dimensions, {found} by its bytes")),
     }
@@ -85,14 +103,17 @@ fn words(dataset: &Dataset) -> String {
     if shape.is_empty() { kind } else { format!("{shape} {kind}") }
 }
 
-/// Paths of the datasets, with their dimensions.
+/// Datasets that an error lists.
+const LISTED: usize = 12;
+
+/// Paths of the first datasets, with their dimensions.
 fn list(group: &Group, path: &str, found: &mut Vec<String>) {
-    for name in group.datasets().unwrap_or_default() {
+    for name in group.datasets().unwrap_or_default().into_iter().take(LISTED - found.len()) {
         let words = group.dataset(&name).map_or_else(|error| error.to_string(), |one| words(&one));
         found.push(format!("{path}/{name} ({words})"));
     }
     if path.matches('/').count() < 4 {
-        for name in group.groups().unwrap_or_default() {
+        for name in group.groups().unwrap_or_default().into_iter().take(LISTED) {
             if let Ok(inner) = group.group(&name) {
                 list(&inner, &format!("{path}/{name}"), found);
             }

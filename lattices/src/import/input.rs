@@ -1,12 +1,11 @@
 //! The file that an import begins with: a lattice, or a LOCO file with everything.
 
-use std::fs;
 use std::path::Path;
 
 use super::element::Lattice;
 use super::loco::{self, Lacking, Loco};
 use super::mat::MatFile;
-use super::source::Source;
+use super::source::{Source, bytes};
 use measured::MeasuredError;
 
 /// What was read.
@@ -26,7 +25,7 @@ impl Input {
     pub fn read(path: &Path, lacking: &Lacking) -> Result<Self, MeasuredError> {
         let Source { path: file, name } = Source::of(path);
         let words = file.display().to_string();
-        let bytes = fs::read(&file).map_err(|source| MeasuredError::Read { file: words.clone(), source })?;
+        let bytes = bytes(&file)?;
         if name.is_none() && MatFile::is_one(&bytes) {
             let file = MatFile::of(&words, bytes)?;
             if loco::is_one(&file) {

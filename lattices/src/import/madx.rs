@@ -11,6 +11,7 @@ use super::element::{Element, Format, Lattice, Role};
 use super::fields::{NONE, Strengths, give};
 use measured::MeasuredError;
 use measured::folder::Particle;
+use twin::limits::{FINITE, TEXT};
 
 /// Columns that a ring needs.
 const COLUMNS: [&str; 17] = [
@@ -39,6 +40,9 @@ pub(super) fn read(file: &str, text: &str) -> Result<Lattice, MeasuredError> {
     let mut columns: HashMap<String, usize> = HashMap::new();
     let mut s = 0.0;
     for (index, line) in text.lines().enumerate() {
+        if let Err(exceeded) = TEXT.check(line.len() as u64) {
+            return lattice.refuse(format!("line {}: {exceeded}", index + 1));
+        }
         let mut words = line.split_whitespace();
         match words.next() {
             None | Some("$") => {}
@@ -73,9 +77,8 @@ pub(super) fn read(file: &str, text: &str) -> Result<Lattice, MeasuredError> {
 /// `@ ENERGY %le 1.5`
 fn header(lattice: &mut Lattice, line: usize, words: &[&str]) -> Result<(), MeasuredError> {
     let [name, _, value, ..] = words else { return Ok(()) };
-    let number = |lattice: &Lattice| match value.parse::<f64>() {
-        Ok(number) if number.is_finite() => Ok(number),
-        _ => lattice.refuse(format!("line {line}: {name}: expected a number, found {value}")),
+    let number = |lattice: &Lattice| {
+        FINITE.parse(value).or_else(|problem| lattice.refuse(format!("line {line}: {name}: {problem}")))
     };
     match *name {
         "ENERGY" => lattice.energy = Some(number(lattice)?),
@@ -126,11 +129,8 @@ impl Row<'_> {
     }
 
     fn number(&self, column: &str) -> Result<f64, MeasuredError> {
-        let text = self.text(column)?;
-        match text.parse() {
-            Ok(number) if f64::is_finite(number) => Ok(number),
-            _ => self.lattice.refuse(format!("line {}: {column}: expected a number, found {text}", self.line)),
-        }
+        let refused = |problem| self.lattice.refuse(format!("line {}: {column}: {problem}", self.line));
+        FINITE.parse(self.text(column)?).or_else(refused)
     }
 
     fn optional(&self, column: &str) -> Result<Option<f64>, MeasuredError> {

@@ -14,11 +14,8 @@ use super::element::{Element, Format, Lattice, Role};
 use super::fields::{DISPLACED, Fields, NONE, Strengths, give};
 use measured::MeasuredError;
 use measured::folder::Particle;
+use twin::limits::{Budget, DEPTH, ELEMENTS};
 
-/// Lines within lines beyond this hold themselves.
-const DEEPEST: usize = 50;
-/// More repeats than any line has.
-const MOST_REPEATS: u64 = 10_000;
 /// Kinds without a field that matters here.
 const FIELD_FREE: [&str; 10] = [
     "Drift",
@@ -45,8 +42,14 @@ pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> 
     let Some(start) = used.or(first) else {
         return lattice.refuse("expected `use: NAME` or a Lattice, found neither".into());
     };
-    walk(&mut lattice, &named, start, None, 0)?;
+    Facility { named, entered: Budget::new(ELEMENTS) }.walk(&mut lattice, start, None, 0)?;
     Ok(lattice)
+}
+
+/// What a facility has by name, and how many lines and elements were entered: a line may repeat many of nothing.
+struct Facility<'v> {
+    named: HashMap<&'v str, &'v Value>,
+    entered: Budget,
 }
 
 /// `{name: {kind, ...}}`
@@ -59,44 +62,40 @@ fn kind(value: &Value) -> &str {
     value.get("kind").and_then(Value::as_str).unwrap_or_default()
 }
 
-/// Elements of a lattice's first branch, of a line, or one element.
-fn walk(
-    lattice: &mut Lattice,
-    named: &HashMap<&str, &Value>,
-    name: &str,
-    whole: Option<&Value>,
-    depth: usize,
-) -> Result<(), MeasuredError> {
-    let Some(value) = whole.filter(|one| !kind(one).is_empty()).or_else(|| named.get(name).copied()) else {
-        return lattice.refuse(format!("{name} stands in a line and not in the facility"));
-    };
-    if depth > DEEPEST {
-        return lattice.refuse(format!("{name}: lines within lines more than {DEEPEST} deep"));
-    }
-    let (key, count) = match kind(value) {
-        "Lattice" => ("branches", Some(1)),
-        "BeamLine" => ("line", None),
-        _ => {
-            let file = lattice.file.clone();
-            return element(lattice, &Fields { file: &file, name, value });
-        }
-    };
-    let parts = value.get(key).and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
-    for part in parts.iter().take(count.unwrap_or(parts.len())) {
-        let (name, whole) = match (part.as_str(), entry(part)) {
-            (Some(name), _) => (name, None),
-            (_, Some((name, whole))) => (name, Some(whole)),
-            _ => return lattice.refuse(format!("{name}: expected names and elements in its {key}, found {part}")),
+impl Facility<'_> {
+    /// Elements of a lattice's first branch, of a line, or one element.
+    fn walk(&self, lattice: &mut Lattice, name: &str, whole: Option<&Value>, depth: u64) -> Result<(), MeasuredError> {
+        let Some(value) = whole.filter(|one| !kind(one).is_empty()).or_else(|| self.named.get(name).copied()) else {
+            return lattice.refuse(format!("{name} stands in a line and not in the facility"));
         };
-        let times = whole.and_then(|one| one.get("repeat")).map_or(Some(1), Value::as_u64);
-        let Some(times) = times.filter(|times| *times <= MOST_REPEATS) else {
-            return lattice.refuse(format!("{name}: expected to repeat 0 to {MOST_REPEATS} times"));
-        };
-        for _ in 0..times {
-            walk(lattice, named, name, whole, depth + 1)?;
+        if let Err(exceeded) = DEPTH.check(depth).and_then(|()| self.entered.take(1)) {
+            return lattice.refuse(format!("{name}: {exceeded}"));
         }
+        let (key, count) = match kind(value) {
+            "Lattice" => ("branches", Some(1)),
+            "BeamLine" => ("line", None),
+            _ => {
+                let file = lattice.file.clone();
+                return element(lattice, &Fields { file: &file, name, value });
+            }
+        };
+        let parts = value.get(key).and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
+        for part in parts.iter().take(count.unwrap_or(parts.len())) {
+            let (name, whole) = match (part.as_str(), entry(part)) {
+                (Some(name), _) => (name, None),
+                (_, Some((name, whole))) => (name, Some(whole)),
+                _ => return lattice.refuse(format!("{name}: expected names and elements in its {key}, found {part}")),
+            };
+            let times = whole.and_then(|one| one.get("repeat")).map_or(Some(1), Value::as_u64);
+            let Some(times) = times else {
+                return lattice.refuse(format!("{name}: expected to repeat a whole number of times, found {part}"));
+            };
+            for _ in 0..times {
+                self.walk(lattice, name, whole, depth + 1)?;
+            }
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> {

@@ -1,16 +1,16 @@
 //! A lattice file, read by the format that its content shows.
 
-use std::fs;
 use std::path::Path;
 
 use super::element::Lattice;
 use super::mat::MatFile;
-use super::source::Source;
+use super::source::{Source, bytes};
 use super::{at, at_mat, madx, pals, xsuite};
 use measured::MeasuredError;
+use twin::limits::{DEPTH, Document, ELEMENTS};
 
-/// Nodes of a YAML file at most.
-const LARGEST: usize = 10_000_000;
+/// Nodes of YAML that an element has.
+const NODES: usize = 10;
 
 impl Lattice {
     /// Read a file of any of the formats; of a MAT-file with several lattices `FILE:VARIABLE`.
@@ -20,7 +20,7 @@ impl Lattice {
     pub fn read(path: &Path) -> Result<Self, MeasuredError> {
         let Source { path, name } = Source::of(path);
         let file = path.display().to_string();
-        let bytes = fs::read(&path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
+        let bytes = bytes(&path)?;
         if MatFile::is_one(&bytes) {
             return at_mat::read(&MatFile::of(&file, bytes)?, name.as_deref());
         }
@@ -55,16 +55,21 @@ impl Lattice {
 fn value(file: &str, text: &str) -> Result<serde_json::Value, MeasuredError> {
     let refused = |problem: String| MeasuredError::Table { file: file.into(), problem };
     if text.trim_start().starts_with('{') {
-        return json5::from_str(text).map_err(|error| refused(error.to_string()));
+        return json5::from_str(text).map(|Document(value)| value).map_err(|error| refused(error.to_string()));
     }
     if !text.contains("PALS:") {
         return Err(unknown(file, &first_line(text)));
     }
-    // a large ring has more nodes than the library's own limit
+    // the library's own limits are for less than a large ring; its depth is ours
+    let nodes = NODES * ELEMENTS.most as usize;
     let options = serde_saphyr::options! {
-        budget: serde_saphyr::budget! { max_nodes: LARGEST, max_events: LARGEST },
+        budget: serde_saphyr::budget! {
+            max_nodes: nodes, max_events: 2 * nodes, max_recorded_anchor_events: nodes / 10, max_depth: DEPTH.most as usize,
+        },
+        with_snippet: false,
     };
-    serde_saphyr::from_str_with_options(text, options).map_err(|error| refused(error.to_string()))
+    let document = serde_saphyr::from_str_with_options(text, options);
+    document.map(|Document(value)| value).map_err(|error| refused(error.to_string()))
 }
 
 fn first_line(text: &str) -> String {

@@ -2,6 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
+use measured::MeasuredError;
+use twin::limits::FILE;
+
 /// Where something is read.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Source {
@@ -24,6 +27,11 @@ impl Source {
             None => Self { path: argument.into(), name: None },
         }
     }
+}
+
+/// The bytes of a file.
+pub(super) fn bytes(file: &Path) -> Result<Vec<u8>, MeasuredError> {
+    FILE.bytes(file).map_err(|source| MeasuredError::Read { file: file.display().to_string(), source })
 }
 
 #[cfg(test)]

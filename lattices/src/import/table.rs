@@ -2,15 +2,15 @@
 //! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
 //! A response matrix of the Matlab Middle Layer needs no `NAME`.
 
-use std::fs;
 use std::path::Path;
 
 use super::conventions::Stated;
 use super::hdf5::{self, Matrix};
 use super::instruments::{Channel, Instrument, Order, channel, in_order, label};
 use super::mat::MatFile;
-use super::source::Source;
+use super::source::{Source, bytes};
 use measured::MeasuredError;
+use twin::limits::{Budget, Exceeded, FINITE, MEMORY, TEXT};
 
 /// A table as it was read.
 #[derive(Debug, Clone)]
@@ -39,7 +39,7 @@ impl Table {
     pub fn read(path: &Path) -> Result<Self, MeasuredError> {
         let source = Source::of(path);
         let file = source.path.display().to_string();
-        let bytes = fs::read(&source.path).map_err(|source| MeasuredError::Read { file: file.clone(), source })?;
+        let bytes = bytes(&source.path)?;
         if MatFile::is_one(&bytes) {
             let (matrix, stated) = MatFile::of(&file, bytes)?.matrix(source.name.as_deref())?;
             return Self::of(path, matrix, stated);
@@ -61,8 +61,9 @@ impl Table {
         let rows = lines.map(|(at, values)| Line { number: at + 1, name: None, values: values.to_vec() }).collect();
         let mut table = Self { file: path.display().to_string(), stated, columns: None, rows };
         table.check()?;
-        match values.iter().position(|one| one.is_infinite()) {
-            Some(at) => table.refuse(format!("line {}: expected a number, found {}", at / width + 1, values[at])),
+        let mut numbers = values.iter().enumerate().filter(|(_, one)| !one.is_nan());
+        match numbers.find_map(|(at, one)| Some((at, FINITE.check(*one).err()?))) {
+            Some((at, problem)) => table.refuse(format!("line {}: {problem}", at / width + 1)),
             None => Ok(table),
         }
     }
@@ -105,10 +106,8 @@ impl Table {
         let name = (!is_number(&cells[0])).then(|| cells.remove(0));
         let values = cells.iter().map(|cell| match cell.as_str() {
             "" => Ok(f64::NAN),
-            cell => match cell.parse::<f64>() {
-                Ok(value) if !value.is_infinite() => Ok(value),
-                _ => self.refuse(format!("line {number}: expected a number, found {cell}")),
-            },
+            cell if cell.parse().is_ok_and(f64::is_nan) => Ok(f64::NAN),
+            cell => FINITE.parse(cell).or_else(|problem| self.refuse(format!("line {number}: {problem}"))),
         });
         Ok(Line { number, name, values: values.collect::<Result<_, _>>()? })
     }
@@ -212,15 +211,23 @@ fn is_number(cell: &str) -> bool {
 
 /// Cells of each line that has some, with the number of the line; `#` begins a comment, whatever stands in it.
 fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredError> {
+    let refused = |problem: String| MeasuredError::Table { file: file.into(), problem };
+    if let Some((number, exceeded)) = long(text) {
+        return Err(refused(format!("line {number}: {exceeded}")));
+    }
+    let memory = Budget::new(MEMORY);
+    let whole = |number: usize, cells: Vec<&str>| {
+        let bytes = LINE + cells.iter().map(|cell| CELL + cell.len()).sum::<usize>();
+        memory.take(bytes as u64).map_err(|exceeded| refused(format!("line {number}: {exceeded}")))?;
+        Ok((number, cells.into_iter().map(str::to_owned).collect()))
+    };
     let is_comment = |line: &str| line.trim_start().starts_with('#');
     let text: String =
         text.lines().map(|line| if is_comment(line) { "\n".into() } else { format!("{line}\n") }).collect();
     let Some(delimiter) = [',', ';', '\t'].into_iter().find(|one| text.contains(*one)) else {
-        let words = text
-            .lines()
-            .enumerate()
-            .map(|(number, line)| (number + 1, line.split_whitespace().map(str::to_owned).collect::<Vec<_>>()));
-        return Ok(words.filter(|(_, words)| !words.is_empty()).collect());
+        let lines = text.lines().enumerate();
+        let words = lines.map(|(number, line)| (number + 1, line.split_whitespace().collect::<Vec<_>>()));
+        return words.filter(|(_, words)| !words.is_empty()).map(|(number, words)| whole(number, words)).collect();
     };
     let mut reader = csv::ReaderBuilder::new()
         .has_headers(false)
@@ -229,9 +236,18 @@ fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredEr
         .delimiter(delimiter as u8)
         .from_reader(text.as_bytes());
     let lines = reader.records().map(|record| {
-        let record = record.map_err(|error| MeasuredError::Table { file: file.into(), problem: error.to_string() })?;
-        let number = record.position().map_or(0, |position| position.line() as usize);
-        Ok((number, record.iter().map(str::to_owned).collect()))
+        let record = record.map_err(|error| refused(error.to_string()))?;
+        whole(record.position().map_or(0, |position| position.line() as usize), record.iter().collect())
     });
     lines.collect()
+}
+
+/// What a line takes before and after its cells are numbers [B].
+const LINE: usize = 2 * size_of::<Line>();
+/// What a cell takes beside its text, and its number after that [B].
+const CELL: usize = size_of::<String>() + size_of::<f64>();
+
+/// A line that is too long.
+fn long(text: &str) -> Option<(usize, Exceeded)> {
+    text.lines().enumerate().find_map(|(index, line)| Some((index + 1, TEXT.check(line.len() as u64).err()?)))
 }

@@ -11,6 +11,7 @@ use super::element::{Element, Format, Lattice, Role};
 use super::fields::{DISPLACED, Fields, NONE, Strengths, give};
 use measured::MeasuredError;
 use measured::folder::Particle;
+use twin::limits::{DEPTH, Exceeded};
 
 /// Classes without a field.
 const FIELD_FREE: [&str; 6] = ["Drift", "DriftExact", "Marker", "Device", "BeamPositionMonitor", "ParticlesMonitor"];
@@ -26,29 +27,30 @@ pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> 
     };
     for name in names {
         let name = name.as_str().unwrap_or_default();
-        let Some(value) = original(elements, name) else {
+        let found = original(elements, name);
+        let found = found.or_else(|exceeded| lattice.refuse(format!("element {name}, a replica: {exceeded}")))?;
+        let Some(value) = found else {
             return lattice
                 .refuse(format!("element {name} of element_names, or what it replicates, is not among the elements"));
         };
         let fields = Fields { file, name, value };
         match class(value) {
-            "DriftSlice" | "DriftExactSlice" => lattice.elements.push(slice(&fields, elements)?),
+            "DriftSlice" | "DriftExactSlice" => lattice.push(slice(&fields, elements)?)?,
             _ => element(&mut lattice, &fields)?,
         }
     }
     Ok(lattice)
 }
 
-/// An element, or the one that a replica is of, which may be a replica again; none that come back to themselves.
-fn original<'v>(elements: &'v Map<String, Value>, name: &str) -> Option<&'v Value> {
-    let mut found = elements.get(name)?;
-    for _ in 0..elements.len() {
-        if class(found) != "Replica" {
-            return Some(found);
-        }
-        found = elements.get(found.get("parent_name")?.as_str()?)?;
+/// An element, or the one that a replica is of, which may be a replica again.
+fn original<'v>(elements: &'v Map<String, Value>, name: &str) -> Result<Option<&'v Value>, Exceeded> {
+    let mut found = elements.get(name);
+    for level in 1.. {
+        let Some(replica) = found.filter(|one| class(one) == "Replica") else { break };
+        DEPTH.check(level)?;
+        found = replica.get("parent_name").and_then(Value::as_str).and_then(|parent| elements.get(parent));
     }
-    None
+    Ok(found)
 }
 
 fn class(value: &Value) -> &str {
@@ -102,8 +104,7 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
         }
         _ => return Err(fields.wrong(format!("class {class} acts on the orbit and is not known here"))),
     }
-    lattice.elements.push(one);
-    Ok(())
+    lattice.push(one)
 }
 
 fn bend(lattice: &mut Lattice, mut one: Element, fields: &Fields) -> Result<(), MeasuredError> {

@@ -7,6 +7,7 @@ use measured::{Believed, Folder, Settings, Straightened};
 use report::Page;
 use results::{DiagnosedMatrix, FittedMatrix, StatedModel, output};
 use twin::Rf;
+use twin::limits::{self, FILE};
 
 use super::{CommandError, check_outputs, deliver};
 use crate::cli::{self, Common, Method, Priors};
@@ -71,8 +72,8 @@ pub(super) fn write(path: &Path, page: &Page) -> Result<(), CommandError> {
 fn believed(options: &cli::Diagnose) -> Result<Option<Believed>, CommandError> {
     let Some(path) = &options.model_file else { return Ok(None) };
     let wrong = |why: String| CommandError::Input(format!("{}: {why}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-    let stated: StatedModel = serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+    let text = FILE.text(path).map_err(|error| wrong(twin::unreadable(&error)))?;
+    let stated: StatedModel = limits::json(&text).map_err(|error| wrong(error.to_string()))?;
     let mut model = stated.into();
     for named in &options.without {
         Believed::take_out(&mut model, named)?;

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use results::{ResponseResult, factors};
+use twin::limits::{self, FILE};
 use twin::{EffectError, Machine, Rf, Ring};
 
 use super::{CommandError, check_outputs, deliver, machine};
@@ -31,7 +32,7 @@ pub fn run(options: &Response) -> Result<(), CommandError> {
 /// Factor of every quadrupole: those in the file, 1 for the others.
 pub(super) fn vars(path: &Path, ring: &Ring) -> Result<Vec<f64>, CommandError> {
     let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|e| wrong(twin::unreadable(&e)))?;
-    let file: BTreeMap<String, f64> = serde_json::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    let text = FILE.text(path).map_err(|e| wrong(twin::unreadable(&e)))?;
+    let file: BTreeMap<String, f64> = limits::json(&text).map_err(|e| wrong(e.to_string()))?;
     factors(&file, ring).map_err(wrong)
 }

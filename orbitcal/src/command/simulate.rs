@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufRead, Write};
+use std::io::{self, Write};
 use std::path::Path;
 
 use control::Plan;
@@ -15,6 +15,7 @@ use results::output;
 use serde::Deserialize;
 use serde_json::json;
 use twin::Ring;
+use twin::limits::{self, TEXT};
 
 use super::response::vars;
 use super::{CommandError, machine};
@@ -51,9 +52,9 @@ pub fn run(options: &Simulate) -> Result<(), CommandError> {
     let mut machine = SimulatedMachine::try_new(&plan, &ring, settings).map_err(|error| input(&error))?;
     let mut exact = options.exact.as_deref().map(|path| exact(path, &ring)).transpose()?;
     output::say(json!({"records": machine.records()}))?;
-    for line in io::stdin().lock().lines() {
+    for line in TEXT.lines(io::stdin().lock()) {
         let line = line.map_err(CommandError::other)?;
-        let Cycle { set, seconds } = serde_json::from_str(&line).map_err(|error| input(&format!("stdin: {error}")))?;
+        let Cycle { set, seconds } = limits::json(&line).map_err(|error| input(&format!("stdin: {error}")))?;
         let values = machine.cycle(&set, seconds);
         if let Some(file) = &mut exact {
             let readings: Vec<String> = machine.exact_mm().iter().map(|mm| format!("{mm:.6}")).collect();

@@ -1,11 +1,11 @@
 //! `orbitcal validate`: simulated blind campaigns through the diagnosis, on all cores; a stopped run resumes.
 
-use std::fs;
 use std::path::Path;
 
 use diagnosis::DataError;
 use inference::{Campaign, Recording};
 use results::output;
+use twin::limits::FILE;
 use twin::{EffectKind, Ring};
 use validation::{CampaignError, Case, Cases, Class, Outcome, Tables, UnmodelledKind, known, run_all};
 
@@ -80,7 +80,7 @@ const MARKS: [&str; 2] = ["<!-- tables of make validate -->", "<!-- end of table
 /// Replace what is between the marks of a page.
 fn write_between_marks(path: &Path, tables: &str) -> Result<(), CommandError> {
     let wrong = |what: String| CommandError::Input(format!("{}: {what}", path.display()));
-    let page = fs::read_to_string(path).map_err(|error| wrong(twin::unreadable(&error)))?;
+    let page = FILE.text(path).map_err(|error| wrong(twin::unreadable(&error)))?;
     let [start, end] = MARKS.map(|mark| page.find(mark));
     let (Some(start), Some(end)) = (start, end) else {
         return Err(wrong(format!("expected the marks {MARKS:?}, found none")));

@@ -30,7 +30,8 @@ fn sequences(rows: &[Value]) -> Vec<u64> {
     rows.iter().map(|row| row["sequence"].as_u64().unwrap()).collect()
 }
 
-/// Send frames one by one, each once the one before is estimated and its millisecond is over.
+/// Send frames one by one, each once the one before is estimated: they come more than the millisecond of the history apart, however busy
+/// the machine is.
 fn feed(subscriber: &mut Subscriber, port: u16, numbers: core::ops::RangeInclusive<u32>) -> TcpStream {
     let (frames, mut line) = (Frames::new(), connected(|| TcpStream::connect(("127.0.0.1", port))));
     for sequence in numbers {

@@ -64,7 +64,7 @@ impl Fault {
 }
 
 /// Frames with their faults, sent as fast as estimates of them come back; returns which survived.
-fn feed(mut line: TcpStream, count: u32, heard: &AtomicU32) -> Vec<u32> {
+fn feed(mut line: TcpStream, count: u32, [sent, heard]: [&AtomicU32; 2]) -> Vec<u32> {
     let (frames, mut random, mut survived) = (Frames::new(), StdRng::seed_from_u64(5), Vec::new());
     for sequence in 10..10 + count {
         while survived.len() as u32 > heard.load(Ordering::Acquire) + ON_THE_WAY {
@@ -74,6 +74,7 @@ fn feed(mut line: TcpStream, count: u32, heard: &AtomicU32) -> Vec<u32> {
         let bytes = fault.map_or_else(|| frames.wire(sequence), |fault| fault.put_into(&frames, sequence, &mut random));
         line.write_all(&bytes).unwrap();
         survived.extend(fault.is_none_or(Fault::is_survived).then_some(sequence));
+        sent.store(survived.len() as u32, Ordering::Release);
     }
     survived
 }
@@ -93,13 +94,12 @@ fn soak(test: &str, count: u32) -> u64 {
     let mut subscriber = Subscriber::try_new(&place.service).unwrap();
     let mut daemon = place.start();
     let line = connected(|| TcpStream::connect(("127.0.0.1", port)));
-    let (heard, frames, mut taken) = (AtomicU32::new(0), Frames::new(), Vec::new());
+    let ([sent, heard], frames, mut taken) = ([const { AtomicU32::new(0) }; 2], Frames::new(), Vec::new());
     let (mut core, mut early, mut late) = (frames.core(), 0, 0);
     let survived = thread::scope(|scope| {
-        let feeder = scope.spawn(|| feed(line, count, &heard));
+        let feeder = scope.spawn(|| feed(line, count, [&sent, &heard]));
         let mut news = Instant::now();
-        // silence after the feeder's end is the end
-        while !feeder.is_finished() || news.elapsed() < Duration::from_secs(1) {
+        while !feeder.is_finished() || (taken.len() as u32) < sent.load(Ordering::Acquire) {
             assert!(news.elapsed() < SOON, "no estimate after {} of {count} frames", taken.len());
             for published in subscriber.wait(Duration::from_millis(20)).unwrap() {
                 let record = published.record;

@@ -27,7 +27,9 @@ pub struct Tunes {
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 #[allow(missing_docs)] // named after what they are
 pub struct TunesMeasured {
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub x: Option<TuneMeasured>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub y: Option<TuneMeasured>,
 }
 

@@ -14,13 +14,13 @@ use super::counts::{Counts, Plugin};
 use super::{Error, Function, Image};
 
 /// The emulator opens its sockets in well under a second; a busy machine may take longer.
-const START: Duration = Duration::from_secs(20);
+const START: Duration = Duration::from_secs(120);
 
 /// Time to end after it was asked to.
-const STOP: Duration = Duration::from_secs(20);
+const STOP: Duration = Duration::from_secs(120);
 
 /// Longest silence of the UART: a test fails, rather than waiting for ever.
-const SILENCE: Duration = Duration::from_secs(30);
+const SILENCE: Duration = Duration::from_secs(120);
 
 const PAUSE: Duration = Duration::from_millis(5);
 

@@ -22,6 +22,7 @@ use core::fmt;
 use core::str::FromStr;
 
 use crate::lattice::{Plane, Ring};
+use crate::limits::FINITE;
 use crate::orbit::OrbitError;
 use crate::site::Site;
 
@@ -318,10 +319,8 @@ impl FromStr for EffectText {
         let (head, amplitude) = text.split_once('=').map_or((text, None), |(head, amplitude)| (head, Some(amplitude)));
         let (word, place) = head.split_once('@').unwrap_or((head, ""));
         let kind: EffectKind = word.parse()?;
-        let finite = |text: &str| text.parse().ok().filter(|a: &f64| a.is_finite());
-        let amplitude = amplitude.map_or(Ok(1.0), |text| {
-            finite(text).ok_or_else(|| EffectError::Amplitude { effect: word.into(), found: text.into() })
-        })?;
+        let amplitude = amplitude.map_or(Ok(1.0), |text| FINITE.parse(text));
+        let amplitude = amplitude.map_err(|problem| EffectError::Amplitude { effect: word.into(), problem })?;
         Ok(Self { kind, place: place.into(), amplitude })
     }
 }
@@ -343,13 +342,13 @@ pub enum EffectError {
         /// What was written.
         found: String,
     },
-    /// An amplitude that is not a finite number.
-    #[error("effect {effect}: expected a finite amplitude, found {found:?}")]
+    /// An amplitude that is no number of a measurement.
+    #[error("effect {effect}: amplitude: {problem}")]
     Amplitude {
         /// The effect.
         effect: String,
-        /// What was written.
-        found: String,
+        /// What was expected, what was written.
+        problem: String,
     },
     /// A place that the ring lacks, or that the kind cannot act on.
     #[error("effect {kind}: expected {expected}, found {found:?}")]
@@ -387,8 +386,8 @@ mod tests {
         let refused = |text: &str| Effect::parse(text, &ring).unwrap_err().to_string();
         assert!(refused("bpm_gian@x_E4").starts_with("unknown effect \"bpm_gian\"; known: bpm_gain,"));
         let cases = [
-            ("bpm_gain@x_E4=nan", "effect bpm_gain: expected a finite amplitude, found \"nan\""),
-            ("bpm_gain@x_E4=", "effect bpm_gain: expected a finite amplitude, found \"\""),
+            ("bpm_gain@x_E4=nan", "effect bpm_gain: amplitude: expected a number from -1e15 to 1e15, found nan"),
+            ("bpm_gain@x_E4=", "effect bpm_gain: amplitude: expected a number from -1e15 to 1e15, found \"\""),
             ("bpm_gain@x_C5", "effect bpm_gain: expected a monitor such as x_A6, found \"x_C5\""),
             (
                 "bpm_swap@x_E4,y_C5",

@@ -111,6 +111,7 @@ pub fn unreadable(error: &std::io::Error) -> String {
     match error.kind() {
         std::io::ErrorKind::NotFound => "file not found".into(),
         std::io::ErrorKind::InvalidData => "expected UTF-8 text".into(),
+        std::io::ErrorKind::FileTooLarge => error.to_string(),
         kind => kind.to_string(),
     }
 }

@@ -10,6 +10,7 @@ use super::label::{Named, labels};
 use super::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, ParameterPrior, Particle, Plane, Ring, ramp,
 };
+use crate::limits;
 
 #[derive(Deserialize)]
 struct MachineFile {
@@ -111,8 +112,7 @@ impl Ring {
     /// [`LatticeError`], naming the element and the numbers that disagree.
     pub fn read(path: &Path) -> Result<Self, LatticeError> {
         let shown = path.display().to_string();
-        let text =
-            std::fs::read_to_string(path).map_err(|source| LatticeError::Read { path: shown.clone(), source })?;
+        let text = limits::FILE.text(path).map_err(|source| LatticeError::Read { path: shown.clone(), source })?;
         Self::parse(&text, &shown)
     }
 
@@ -122,7 +122,7 @@ impl Ring {
     /// As [`Ring::read`].
     pub fn parse(text: &str, path: &str) -> Result<Self, LatticeError> {
         let file: MachineFile =
-            serde_json::from_str(text).map_err(|source| LatticeError::Syntax { path: path.into(), source })?;
+            limits::json(text).map_err(|source| LatticeError::Syntax { path: path.into(), source })?;
         let name = Path::new(path).file_name().unwrap_or_default().to_string_lossy().into_owned();
         file.ring(name)
     }

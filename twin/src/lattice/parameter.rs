@@ -1,6 +1,7 @@
 //! What powers a quadrupole, and what of it is fitted.
 
 use super::LatticeError;
+use crate::limits::Range;
 
 /// A quadrupole of a ring.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,12 +49,15 @@ impl Default for ParameterPrior {
 }
 
 impl ParameterPrior {
+    /// Widths that are told from none, and from no prior at all.
+    pub const WIDTHS: Range = Range::new(1e-6, 1.0, "");
+
     /// This one, but for a width and a range that `name` states.
     pub(super) fn or(self, name: &str, width: Option<f64>, range: Option<[f64; 2]>) -> Result<Self, LatticeError> {
         let refused = |field, found| Err(LatticeError::Field { name: name.into(), field, found });
         let Self { width, range } = Self { width: width.unwrap_or(self.width), range: range.unwrap_or(self.range) };
-        if width <= 0.0 {
-            return refused("a prior_width above 0", width.to_string());
+        if Self::WIDTHS.check(width).is_err() {
+            return refused("a prior_width from 1e-6 to 1", format!("{width:?}"));
         }
         if !(0.0 < range[0] && range[0] < 1.0 && 1.0 < range[1]) {
             return refused("a range of two factors, one between 0 and 1 and one above 1", format!("{range:?}"));

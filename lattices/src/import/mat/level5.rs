@@ -9,15 +9,11 @@ use std::io::Read;
 
 use flate2::read::ZlibDecoder;
 
-use super::Mat;
+use super::{Mat, NUMBER, VALUE};
+use twin::limits::{Budget, DEPTH, Exceeded, MEMORY, TEXT};
 
 /// Length of the text and of the version at the beginning.
 const HEADER: usize = 128;
-/// Bytes of all compressed variables together at most.
-const LARGEST: u64 = 1 << 28;
-/// Structs within structs at most.
-const DEEPEST: usize = 64;
-
 type Found<T> = Result<T, String>;
 
 /// Variables by name.
@@ -28,16 +24,16 @@ pub(super) fn variables(bytes: &[u8]) -> Found<Vec<(String, Mat)>> {
         b"MI" => false,
         _ => return Err("no mark of the byte order at byte 126: not a MAT-file of level 5".into()),
     };
-    let mut reader = Reader { bytes: &bytes[HEADER..], is_little };
-    let mut left = LARGEST;
+    let memory = Budget::new(MEMORY);
+    let form = Form { is_little, memory: &memory };
+    let mut reader = Reader { bytes: &bytes[HEADER..], form };
     let mut found = Vec::new();
     while !reader.bytes.is_empty() {
         let element = reader.element()?;
         let name_and_value = match element.kind {
-            Kind::Matrix => matrix(element.within(is_little), 0),
-            Kind::Compressed => inflate(element.bytes, &mut left).and_then(|inflated| {
-                Reader { bytes: &inflated, is_little }.element().and_then(|one| one.matrix(is_little, 0))
-            }),
+            Kind::Matrix => element.matrix(form, 0),
+            Kind::Compressed => inflate(element.bytes, &memory)
+                .and_then(|inflated| Reader { bytes: &inflated, form }.element().and_then(|one| one.matrix(form, 0))),
             other => Err(format!("expected a variable, found an element of type {other:?}")),
         };
         let (name, value) = name_and_value.map_err(|problem| format!("variable {}: {problem}", found.len() + 1))?;
@@ -48,14 +44,16 @@ pub(super) fn variables(bytes: &[u8]) -> Found<Vec<(String, Mat)>> {
     Ok(found)
 }
 
-fn inflate(bytes: &[u8], left: &mut u64) -> Found<Vec<u8>> {
+fn inflate(bytes: &[u8], memory: &Budget) -> Found<Vec<u8>> {
     let mut inflated = Vec::new();
-    let mut decoder = ZlibDecoder::new(bytes).take(*left + 1);
+    let mut decoder = ZlibDecoder::new(bytes).take(memory.left() + 1);
     decoder.read_to_end(&mut inflated).map_err(|error| format!("compressed: {error}"))?;
-    *left = left
-        .checked_sub(inflated.len() as u64)
-        .ok_or_else(|| format!("compressed variables of more than {LARGEST} bytes"))?;
+    memory.take(inflated.len() as u64).map_err(words)?;
     Ok(inflated)
+}
+
+fn words(exceeded: Exceeded) -> String {
+    exceeded.to_string()
 }
 
 /// Types of elements.
@@ -101,11 +99,18 @@ impl Kind {
     }
 }
 
+/// How a file is read: the order of its bytes, and the memory that its values may take.
+#[derive(Debug, Clone, Copy)]
+struct Form<'a> {
+    is_little: bool,
+    memory: &'a Budget,
+}
+
 /// What is left of an element's bytes.
 #[derive(Debug, Clone, Copy)]
 struct Reader<'a> {
     bytes: &'a [u8],
-    is_little: bool,
+    form: Form<'a>,
 }
 
 /// An element: its type and its bytes.
@@ -125,7 +130,7 @@ impl<'a> Reader<'a> {
 
     fn word(&mut self) -> Found<u32> {
         let bytes = self.take(4)?.try_into().expect("four were taken");
-        Ok(if self.is_little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) })
+        Ok(if self.form.is_little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) })
     }
 
     fn element(&mut self) -> Found<Element<'a>> {
@@ -150,20 +155,17 @@ impl<'a> Reader<'a> {
 }
 
 impl<'a> Element<'a> {
-    fn within(self, is_little: bool) -> Reader<'a> {
-        Reader { bytes: self.bytes, is_little }
-    }
-
-    fn matrix(self, is_little: bool, depth: usize) -> Found<(String, Mat)> {
+    fn matrix(self, form: Form<'a>, depth: u64) -> Found<(String, Mat)> {
         match self.kind {
-            Kind::Matrix => matrix(self.within(is_little), depth),
+            Kind::Matrix => matrix(Reader { bytes: self.bytes, form }, depth),
             other => Err(format!("expected a matrix, found an element of type {other:?}")),
         }
     }
 
-    fn numbers(self, is_little: bool) -> Found<Vec<f64>> {
+    fn numbers(self, Form { is_little, memory }: Form) -> Found<Vec<f64>> {
         macro_rules! all {
-            ($number:ty) => {
+            ($number:ty) => {{
+                memory.take(NUMBER * (self.bytes.len() / size_of::<$number>()) as u64).map_err(words)?;
                 self.bytes
                     .chunks_exact(size_of::<$number>())
                     .map(|one| {
@@ -171,7 +173,7 @@ impl<'a> Element<'a> {
                         (if is_little { <$number>::from_le_bytes(one) } else { <$number>::from_be_bytes(one) }) as f64
                     })
                     .collect()
-            };
+            }};
         }
         Ok(match self.kind {
             Kind::Int8 => all!(i8),
@@ -194,27 +196,26 @@ impl<'a> Element<'a> {
 }
 
 /// A matrix of any class, and its name.
-fn matrix(mut reader: Reader, depth: usize) -> Found<(String, Mat)> {
-    if depth > DEEPEST {
-        return Err(format!("more than {DEEPEST} structs or cells within each other"));
-    }
+fn matrix(mut reader: Reader, depth: u64) -> Found<(String, Mat)> {
+    DEPTH.check(depth).and_then(|()| reader.form.memory.take(VALUE)).map_err(words)?;
     if reader.bytes.is_empty() {
         return Ok((String::new(), Mat::Numbers(vec![0, 0], Vec::new())));
     }
-    let flags = reader.element()?.numbers(reader.is_little)?;
+    let flags = reader.element()?.numbers(reader.form)?;
     let flags = *flags.first().ok_or("a matrix without flags")? as u32;
     let class = flags & 0xff;
     if class == 17 {
         return Ok((reader.element()?.name(), Mat::Other("object")));
     }
-    let shape = shape(reader.element()?.numbers(reader.is_little)?)?;
+    let shape = shape(reader.element()?.numbers(reader.form)?)?;
     let name = reader.element()?.name();
+    TEXT.check(name.len() as u64).map_err(words)?;
     let in_name = |problem: String| if name.is_empty() { problem } else { format!("{name}: {problem}") };
     let value = contents(&mut reader, class, shape, depth).map_err(in_name)?;
     Ok((name, value))
 }
 
-fn contents(reader: &mut Reader, class: u32, shape: Vec<usize>, depth: usize) -> Found<Mat> {
+fn contents(reader: &mut Reader, class: u32, shape: Vec<usize>, depth: u64) -> Found<Mat> {
     match class {
         1 => cells(reader, shape, depth),
         2 => structs(reader, shape, depth),
@@ -225,7 +226,7 @@ fn contents(reader: &mut Reader, class: u32, shape: Vec<usize>, depth: usize) ->
         4 => text(reader, &shape),
         5 => Ok(Mat::Other("sparse matrix")),
         6..=15 => {
-            let values = reader.element()?.numbers(reader.is_little)?;
+            let values = reader.element()?.numbers(reader.form)?;
             let count: usize = shape.iter().product();
             match values.len() {
                 found if found == count => Ok(Mat::Numbers(shape, values)),
@@ -247,16 +248,18 @@ fn shape(stated: Vec<f64>) -> Found<Vec<usize>> {
     }
 }
 
-fn cells(reader: &mut Reader, shape: Vec<usize>, depth: usize) -> Found<Mat> {
+fn cells(reader: &mut Reader, shape: Vec<usize>, depth: u64) -> Found<Mat> {
     let count: usize = shape.iter().product();
-    let values = (0..count).map(|_| Ok(reader.element()?.matrix(reader.is_little, depth + 1)?.1));
+    let values = (0..count).map(|_| Ok(reader.element()?.matrix(reader.form, depth + 1)?.1));
     Ok(Mat::Cells(shape, values.collect::<Found<_>>()?))
 }
 
-fn structs(reader: &mut Reader, shape: Vec<usize>, depth: usize) -> Found<Mat> {
-    let width = reader.element()?.numbers(reader.is_little)?;
+fn structs(reader: &mut Reader, shape: Vec<usize>, depth: u64) -> Found<Mat> {
+    let width = reader.element()?.numbers(reader.form)?;
     let width = width.first().map_or(0, |width| *width as usize);
     let names = reader.element()?;
+    let count = names.bytes.len() / width.max(1);
+    reader.form.memory.take((count * size_of::<String>() + names.bytes.len()) as u64).map_err(words)?;
     let names: Vec<String> = match width {
         0 => Vec::new(),
         width => names.bytes.chunks_exact(width).map(|bytes| Element { bytes, ..names }.name()).collect(),
@@ -267,7 +270,7 @@ fn structs(reader: &mut Reader, shape: Vec<usize>, depth: usize) -> Found<Mat> {
     let count: usize = shape.iter().product();
     let one = |reader: &mut Reader| {
         let fields = names.iter().map(|name| {
-            let value = reader.element().and_then(|one| one.matrix(reader.is_little, depth + 1));
+            let value = reader.element().and_then(|one| one.matrix(reader.form, depth + 1));
             Ok(value.map_err(|problem| format!("{name}: {problem}"))?.1)
         });
         fields.collect::<Found<Vec<Mat>>>()
@@ -279,10 +282,11 @@ fn structs(reader: &mut Reader, shape: Vec<usize>, depth: usize) -> Found<Mat> {
 /// Characters, read across the lines of a matrix of them.
 fn text(reader: &mut Reader, shape: &[usize]) -> Found<Mat> {
     let element = reader.element()?;
+    reader.form.memory.take((element.bytes.len() * size_of::<char>()) as u64).map_err(words)?;
     let characters: Vec<char> = match element.kind {
         Kind::Utf8 => String::from_utf8_lossy(element.bytes).chars().collect(),
         _ => {
-            let codes = element.numbers(reader.is_little)?.into_iter().map(|one| one as u16);
+            let codes = element.numbers(reader.form)?.into_iter().map(|one| one as u16);
             char::decode_utf16(codes).map(|one| one.unwrap_or(char::REPLACEMENT_CHARACTER)).collect()
         }
     };

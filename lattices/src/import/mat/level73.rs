@@ -7,13 +7,9 @@
 
 use hdf5_pure::{AttrValue, DType, Dataset, File, Group, Object};
 
-use super::{Mat, Shape};
+use super::{Mat, NUMBER, Shape, VALUE};
 use crate::import::hdf5;
-
-/// Structs within structs at most.
-const DEEPEST: usize = 64;
-/// Values at most: references may form circles.
-const MOST: usize = 10_000_000;
+use twin::limits::{Budget, DEPTH, MEMORY};
 
 /// True of such a file: Matlab's text, then an HDF5 file behind 512 bytes.
 pub(super) fn is_one(bytes: &[u8]) -> bool {
@@ -23,7 +19,7 @@ pub(super) fn is_one(bytes: &[u8]) -> bool {
 /// Variables by name.
 pub(super) fn variables(bytes: Vec<u8>) -> Result<Vec<(String, Mat)>, String> {
     let file = File::from_bytes(bytes).map_err(|error| error.to_string())?;
-    let mut reader = Reader { left: MOST };
+    let reader = Reader { memory: Budget::new(MEMORY) };
     let root = file.root();
     let mut found = Vec::new();
     // names with # hold what others refer to
@@ -39,24 +35,34 @@ fn names(group: &Group) -> Result<Vec<String>, String> {
     both.map_err(|error| error.to_string())
 }
 
+/// What reads the file, and the memory that its values may take: references may form circles.
 struct Reader {
-    left: usize,
+    memory: Budget,
 }
 
 impl Reader {
-    fn count(&mut self, depth: usize) -> Result<(), String> {
-        self.left = self.left.checked_sub(1).ok_or_else(|| format!("more than {MOST} values"))?;
-        if depth > DEEPEST { Err(format!("more than {DEEPEST} structs or cells within each other")) } else { Ok(()) }
+    fn count(&self, depth: u64) -> Result<(), String> {
+        DEPTH.check(depth).and_then(|()| self.memory.take(VALUE)).map_err(|exceeded| exceeded.to_string())
     }
 
-    fn member(&mut self, group: &Group, name: &str, depth: usize) -> Result<Mat, String> {
+    fn numbers(&self, dataset: &Dataset) -> Result<Vec<f64>, String> {
+        hdf5::numbers(dataset, &self.memory, NUMBER)
+    }
+
+    /// What a dataset refers to.
+    fn objects(&self, dataset: &Dataset) -> Result<Vec<Object>, String> {
+        hdf5::take(dataset, &self.memory, OBJECT)?;
+        dataset.dereference().map_err(|error| error.to_string())
+    }
+
+    fn member(&self, group: &Group, name: &str, depth: u64) -> Result<Mat, String> {
         match group.dataset(name) {
             Ok(dataset) => self.dataset(&dataset, depth),
             Err(_) => self.group(&group.group(name).map_err(|error| error.to_string())?, depth),
         }
     }
 
-    fn object(&mut self, object: &Object, depth: usize) -> Result<Mat, String> {
+    fn object(&self, object: &Object, depth: u64) -> Result<Mat, String> {
         match object {
             Object::Dataset(dataset) => self.dataset(dataset, depth),
             Object::Group(group) => self.group(group, depth),
@@ -64,38 +70,38 @@ impl Reader {
         }
     }
 
-    fn dataset(&mut self, dataset: &Dataset, depth: usize) -> Result<Mat, String> {
+    fn dataset(&self, dataset: &Dataset, depth: u64) -> Result<Mat, String> {
         self.count(depth)?;
         let attributes = dataset.attrs().map_err(|error| error.to_string())?;
         let class = attributes.get("MATLAB_class").and_then(AttrValue::as_str).unwrap_or_default();
         if attributes.contains_key("MATLAB_empty") {
-            return empty(class, dataset);
+            return self.empty(class, dataset);
         }
         let shape: Shape = hdf5::shape(dataset)?.into_iter().rev().collect();
         match class {
             "cell" => {
-                let objects = dataset.dereference().map_err(|error| error.to_string())?;
+                let objects = self.objects(dataset)?;
                 let values = objects.iter().map(|one| self.object(one, depth + 1)).collect::<Result<_, _>>()?;
                 Ok(Mat::Cells(shape, values))
             }
             "char" => {
-                let codes = hdf5::numbers(dataset)?;
+                let codes = self.numbers(dataset)?;
                 let rows = shape.first().copied().unwrap_or(1).max(1);
                 let across = (0..rows.min(codes.len())).flat_map(|row| codes.iter().skip(row).step_by(rows));
                 let text = char::decode_utf16(across.map(|one| *one as u16));
                 Ok(Mat::Text(text.map(|one| one.unwrap_or(char::REPLACEMENT_CHARACTER)).collect()))
             }
             "double" | "single" | "logical" | "int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64"
-            | "uint64" => match hdf5::numbers(dataset) {
-                Ok(values) => Ok(Mat::Numbers(shape, values)),
-                Err(_) => Ok(Mat::Other("complex matrix")),
+            | "uint64" => match dataset.dtype() {
+                Ok(DType::Compound(_)) => Ok(Mat::Other("complex matrix")),
+                _ => Ok(Mat::Numbers(shape, self.numbers(dataset)?)),
             },
             _ => Ok(Mat::Other("object")),
         }
     }
 
     /// A struct, or a struct array where all fields are references without a class.
-    fn group(&mut self, group: &Group, depth: usize) -> Result<Mat, String> {
+    fn group(&self, group: &Group, depth: u64) -> Result<Mat, String> {
         self.count(depth)?;
         let names = names(group)?;
         if let Some(array) = self.array(group, &names, depth)? {
@@ -108,7 +114,7 @@ impl Reader {
         Ok(Mat::Structs(vec![1, 1], names, vec![fields]))
     }
 
-    fn array(&mut self, group: &Group, names: &[String], depth: usize) -> Result<Option<Mat>, String> {
+    fn array(&self, group: &Group, names: &[String], depth: u64) -> Result<Option<Mat>, String> {
         let mut shape = None;
         let mut columns = Vec::new();
         for name in names {
@@ -121,7 +127,7 @@ impl Reader {
             if *shape.get_or_insert_with(|| own.clone()) != own {
                 return Err(format!("{name}: {own:?} elements, other fields have another number"));
             }
-            let objects = dataset.dereference().map_err(|error| format!("{name}: {error}"))?;
+            let objects = self.objects(&dataset).map_err(|error| format!("{name}: {error}"))?;
             let values = objects.iter().map(|one| self.object(one, depth + 1));
             columns.push(values.collect::<Result<Vec<_>, _>>().map_err(|problem| format!("{name}: {problem}"))?);
         }
@@ -130,15 +136,18 @@ impl Reader {
         let values = (0..columns[0].len()).map(element).collect();
         Ok(Some(Mat::Structs(shape, names.to_vec(), values)))
     }
+
+    /// Of an empty array the dataset holds the dimensions.
+    fn empty(&self, class: &str, dataset: &Dataset) -> Result<Mat, String> {
+        let shape: Shape = self.numbers(dataset)?.into_iter().map(|one| one as usize).collect();
+        Ok(match class {
+            "cell" => Mat::Cells(shape, Vec::new()),
+            "char" => Mat::Text(String::new()),
+            "struct" => Mat::Structs(shape, Vec::new(), Vec::new()),
+            _ => Mat::Numbers(shape, Vec::new()),
+        })
+    }
 }
 
-/// Of an empty array the dataset holds the dimensions.
-fn empty(class: &str, dataset: &Dataset) -> Result<Mat, String> {
-    let shape: Shape = hdf5::numbers(dataset)?.into_iter().map(|one| one as usize).collect();
-    Ok(match class {
-        "cell" => Mat::Cells(shape, Vec::new()),
-        "char" => Mat::Text(String::new()),
-        "struct" => Mat::Structs(shape, Vec::new(), Vec::new()),
-        _ => Mat::Numbers(shape, Vec::new()),
-    })
-}
+/// What a reference takes, with the object that it names [B]; one takes microseconds to read, too.
+const OBJECT: u64 = 1024;

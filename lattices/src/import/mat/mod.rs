@@ -14,6 +14,11 @@ use measured::MeasuredError;
 /// Dimensions of an array; the first runs fastest.
 pub(super) type Shape = Vec<usize>;
 
+/// What a number takes here, and in the document of a lattice [B].
+const NUMBER: u64 = 40;
+/// The same of a value beside its numbers, with its name in each struct.
+const VALUE: u64 = 300;
+
 /// A value of a file.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Mat {

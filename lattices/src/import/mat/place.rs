@@ -2,6 +2,7 @@
 
 use super::Mat;
 use measured::MeasuredError;
+use twin::limits::FINITE;
 
 /// A value, with its place for errors.
 #[derive(Debug, Clone)]
@@ -84,8 +85,7 @@ impl<'a> Place<'a> {
     /// One number.
     pub fn number(&self) -> Result<f64, MeasuredError> {
         match self.numbers()? {
-            [one] if one.is_finite() => Ok(*one),
-            [one] => Err(self.wrong(&format!("expected a finite number, found {one}"))),
+            [one] => FINITE.check(*one).map_err(|problem| self.wrong(&problem)),
             _ => Err(self.expected("one number")),
         }
     }
