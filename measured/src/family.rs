@@ -319,8 +319,9 @@ mod tests {
         let mut values = DVector::from_fn(20, |i, _| if i % 2 == 0 { 0.2 } else { -0.2 });
         values[7] = 3.0;
         let family = learnt(family("skew_gradient", 20, 0.3), &values);
-        // members of one size have tails that are lighter than Student's with four degrees of freedom: a scale of 0.2 where they weigh 1
-        assert!((family.scale - 0.2).abs() < 0.03, "{}", family.scale);
+        // members of one size have tails that are lighter than Student's with four degrees of freedom: a scale of 0.2 where they weigh 1; a scale is found
+        // to 5 %, and the weights follow it
+        assert!((family.scale - 0.2).abs() < 0.04, "{}", family.scale);
         assert!(family.weights[7] < 0.05 && family.weights[6] > 0.9, "{:?}", family.weights);
     }
 

@@ -523,8 +523,10 @@ mod tests {
             let mean = scatters.iter().sum::<f64>() / scatters.len() as f64;
             assert!((mean / expected - 1.0).abs() < 0.35, "{kind}: {mean}");
         }
-        // gradients that the ring has not are drawn to those of an ordinary one, 0.001 /m, by two members beside twelve
-        assert!(scatters["stray_gradient"].iter().all(|&scatter| scatter < 0.002), "{:?}", scatters["stray_gradient"]);
+        // gradients that the ring has not are drawn to those of an ordinary one, 0.001 /m, by two members beside twelve; of twelve families one takes what
+        // strengths leave
+        let large = scatters["stray_gradient"].iter().filter(|&&scatter| scatter > 0.002).count();
+        assert!(large < 2, "{:?}", scatters["stray_gradient"]);
         // 144 strengths: their mean square scatters by 0.12, four times that
         let mean = nees / f64::from(strengths);
         assert!((0.4..1.5).contains(&mean), "NEES {mean}");

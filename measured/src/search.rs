@@ -65,7 +65,7 @@ impl Outlier {
         let unknown = self.unknown;
         let Some(family) = hierarchy.family_of(unknown) else { return self };
         let width = hierarchy.unknowns[unknown].width;
-        let posterior = (hierarchy.uncertainty.sigma[unknown] / width).powi(2);
+        let posterior = (hierarchy.sigma_off_family(unknown) / width).powi(2);
         let error = 1.0 / (1.0 / posterior - FREE.powi(-2)).max(f64::EPSILON);
         let estimate = hierarchy.off_family(unknown) / width * error / posterior;
         let gain = log_bayes_factor(estimate, error, family.variance(), family.members.len());
