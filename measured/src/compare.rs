@@ -83,7 +83,8 @@ pub struct Before {
     pub cables: Vec<Wiring>,
     data: Data,
     settings: Settings,
-    hierarchy: Hierarchy,
+    /// Its fit with families.
+    pub hierarchy: Hierarchy,
 }
 
 impl Before {

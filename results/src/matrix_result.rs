@@ -386,7 +386,9 @@ impl Row<'_> {
 
     fn is_alike(magnets: &[&ChangeOfOne]) -> bool {
         let first = magnets[0];
-        magnets.iter().all(|one| (one.relative - first.relative).abs() < ALIKE * one.sigma.hypot(first.sigma))
+        magnets.iter().all(|one| {
+            one.changed == first.changed && (one.relative - first.relative).abs() < ALIKE * one.sigma.hypot(first.sigma)
+        })
     }
 
     fn words(&self) -> String {

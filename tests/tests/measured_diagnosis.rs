@@ -251,13 +251,12 @@ fn injections(name: &str, seeds: u64) -> Option<Named> {
     Some(all)
 }
 
-/// Of SPS 23 of 26 are named and two more listed beside a neighbour that looks alike; the other one is an exchange with y_BPM.3, which is broken, told as that monitor
-/// and a dead one. What else is named are y_BPM.3, y_BPM.13 and y_BPM.21, whose gains are half of those of the others: three of seventeen widen their family so
-/// that none stands out of it, until an effect takes one away.
+/// Of SPS 22 of 26 are named and one place is named wrongly: what is not named stands out beside a neighbour that looks alike, or is an exchange with y_BPM.3,
+/// which is broken.
 #[test]
 fn effects_put_into_the_matrix_of_sps_are_named() {
     let Some(all) = injections("sps_2007", 40) else { return };
-    assert!(all.named + all.listed >= 25 && all.named >= 23 && all.wrong <= 6, "{all:?}");
+    assert!(all.named >= 22 && all.wrong <= 1, "{all:?}");
 }
 
 #[test]
