@@ -4,7 +4,7 @@
 //!
 //! Gauss-Newton on the fit's likelihood with the families' priors; about each linearisation scales are learnt, then the error of the model.
 
-use std::cmp::Ordering;
+use core::cmp::Ordering;
 use std::collections::BTreeMap;
 
 use nalgebra::{Cholesky, DMatrix, DVector};

@@ -77,7 +77,7 @@ impl Element {
                 drift(z, depth);
             }
             Kind::Wiggler { focusing } => {
-                let y = z[Y].clone();
+                let y = z[Y];
                 z[PY] -= y * *focusing;
                 drift(z, depth);
             }
