@@ -125,7 +125,7 @@ impl Model {
             match unknown.kind {
                 Kind::Strength(group) | Kind::Added(group) => {
                     for &element in &self.strengths[group] {
-                        if let Some(k1) = gradient_mut(&mut ring.elements[element].kind) {
+                        if let Some(k1) = ring.elements[element].kind.gradient_mut() {
                             *k1 = unknown.kind.gradient(*k1, value);
                         }
                     }
@@ -237,7 +237,9 @@ impl Model {
     /// Gradient of each element of each group per unit of the group's factor [1/m^2], since a magnet may have a factor of its own and one that it shares;
     /// 1 where a gradient is added.
     fn gradients_of_factors(&self, unknowns: &[Unknown], values: &DVector<f64>, ring: &Ring) -> Vec<Vec<f64>> {
-        let now = |group: &Vec<usize>| group.iter().map(|&at| gradient(&ring.elements[at].kind)).collect::<Vec<f64>>();
+        let now = |group: &Vec<usize>| {
+            group.iter().map(|&at| ring.elements[at].kind.gradient().unwrap_or(0.0)).collect::<Vec<f64>>()
+        };
         let mut each: Vec<Vec<f64>> = self.strengths.iter().map(now).collect();
         for (unknown, &value) in unknowns.iter().zip(values) {
             match unknown.kind {
@@ -332,24 +334,6 @@ impl Prediction {
             by_monitor: both(&self.by_monitor, &to.by_monitor),
             by_corrector: both(&self.by_corrector, &to.by_corrector),
         }
-    }
-}
-
-/// Gradient of a magnet [1/m^2].
-fn gradient(kind: &Field) -> f64 {
-    match kind {
-        Field::Quadrupole { k1 } => *k1,
-        Field::Bend(bend) => bend.k1,
-        _ => 0.0,
-    }
-}
-
-/// The same to be changed.
-fn gradient_mut(kind: &mut Field) -> Option<&mut f64> {
-    match kind {
-        Field::Quadrupole { k1 } => Some(k1),
-        Field::Bend(bend) => Some(&mut bend.k1),
-        _ => None,
     }
 }
 

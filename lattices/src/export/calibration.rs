@@ -217,10 +217,9 @@ impl Calibration {
 /// Gradient [1/m^2] of a magnet of some name, and whether it is a dipole's.
 fn gradient_of<'r>(ring: &'r mut Ring, name: &str) -> Option<(&'r mut f64, bool)> {
     let mut named = ring.elements.iter_mut().filter(|one| one.name == name);
-    named.find_map(|one| match &mut one.kind {
-        Kind::Quadrupole { k1 } => Some((k1, false)),
-        Kind::Bend(bend) => Some((&mut bend.k1, true)),
-        _ => None,
+    named.find_map(|one| {
+        let is_dipole = matches!(one.kind, Kind::Bend(_));
+        one.kind.gradient_mut().map(|gradient| (gradient, is_dipole))
     })
 }
 

@@ -125,6 +125,26 @@ pub struct Element {
     pub misalignment: Misalignment,
 }
 
+impl Kind {
+    /// Gradient of a quadrupole or of a dipole [1/m^2], none of what cannot have one along its body.
+    pub fn gradient(&self) -> Option<f64> {
+        match self {
+            Self::Quadrupole { k1 } => Some(*k1),
+            Self::Bend(bend) => Some(bend.k1),
+            _ => None,
+        }
+    }
+
+    /// The same to be changed.
+    pub fn gradient_mut(&mut self) -> Option<&mut f64> {
+        match self {
+            Self::Quadrupole { k1 } => Some(k1),
+            Self::Bend(bend) => Some(&mut bend.k1),
+            _ => None,
+        }
+    }
+}
+
 impl Element {
     /// Field-free space without a name.
     pub fn drift(s: f64, length: f64) -> Self {
