@@ -139,7 +139,7 @@ fn correctors(folder: &Folder, fitted: &Fit) -> Vec<Corrector> {
         _ => None,
     });
     let used = folder.correctors.iter().enumerate().filter(|(_, one)| one.is_used);
-    let one = |(column, one): (usize, &crate::folder::CorrectorRow)| {
+    let one = |(column, one): (usize, &CorrectorRow)| {
         let thin = as_thin(folder, fitted, one);
         let own = one.plane.index();
         let [gain, coupling] = [found[column][0] * thin[own], found[column][1] * thin[1 - own]];

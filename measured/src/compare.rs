@@ -171,7 +171,7 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
     let is_field = |family: &&Family| matches!(family.kind, "stray_gradient" | "skew_gradient") && family.is_learnt();
     for family in changed.families.iter().filter(is_field) {
         let marginal = changed.posterior.marginal(family)?;
-        let ordinary = Family { scale: family.ordinary, ..family.clone() };
+        let ordinary = family.with_scale(family.ordinary);
         // errors that are alike along rows and columns tell less than independent ones
         let mut widening: Vec<f64> =
             family.members.iter().map(|&member| changed.uncertainty.widening(member)).collect();

@@ -237,8 +237,7 @@ pub fn released(
             break;
         }
         found.outliers.extend(further.outliers);
-        let released: Vec<usize> = found.outliers.iter().map(|outlier| outlier.unknown).collect();
-        hierarchy = hierarchy.with_released(folder, (data, model), &released, progress)?;
+        hierarchy = hierarchy.with_released(folder, (data, model), &found.unknowns(), progress)?;
     }
     // what was found first may be explained by what was found after it
     loop {
@@ -248,8 +247,7 @@ pub fn released(
         if found.outliers.len() == count {
             return Ok((hierarchy, found));
         }
-        let released: Vec<usize> = found.outliers.iter().map(|outlier| outlier.unknown).collect();
-        hierarchy = hierarchy.with_released(folder, (data, model), &released, progress)?;
+        hierarchy = hierarchy.with_released(folder, (data, model), &found.unknowns(), progress)?;
     }
 }
 

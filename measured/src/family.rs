@@ -11,10 +11,12 @@
 //! The mean follows from one linearisation to the next, `m` by the posterior of `e`: gains of all monitors and kicks of all correctors together tell nothing, and
 //! what is linear holds for small steps only. Gradients and skew gradients that the lattice does not have are about 0.
 //!
-//! The scale is learnt from the posterior of the members, beside `k` members of an ordinary ring whose scale is `s_0` (expectation and maximisation with a
-//! conjugate prior: A. Gelman et al., Bayesian Data Analysis (2013), ch. 13.6):
+//! The scale is the one of largest evidence. With `P` the prior's precision, `b x - x G x/2` the `ln` likelihood of the members where everything else adapts, and `k`
+//! members of an ordinary ring whose scale is `s_0`, that is the maximum of
 //!
-//! `s^2 = (sum w_i (d_i^2 + var(d_i)) + k s_0^2)/(n + k)`.
+//! `ln det P/2 - ln det(G + P)/2 + b (G + P)^-1 b/2 - k (ln s^2 + s_0^2/s^2)/2`.
+//!
+//! Source: D. J. C. MacKay, Neural Computation 4 (1992) 415, evidence for the scale of a prior.
 
 use std::collections::BTreeMap;
 

@@ -1,8 +1,9 @@
-//! The fit of a matrix with everything that an ordinary ring has: beside the unknowns of the fit as LOCO has them, an integrated gradient in every
-//! dipole and sextupole, a skew gradient in every magnet, and couplings of all instruments. Each kind is a family ([`Family`]) whose scatter is
-//! learnt, so that what the ring does not have costs nothing and takes nothing.
+//! The fit of a matrix with everything that an ordinary ring has: beside the unknowns of the fit as LOCO has them, factors that strengths have in common, an
+//! integrated gradient in every dipole, sextupole and straight, vertical focusing along straights, a skew gradient in every magnet, and couplings of all
+//! instruments. Each kind is a family ([`Family`]) whose scatter is learnt, so that what the ring does not have costs nothing and takes nothing.
 //!
-//! Gauss-Newton on the fit's likelihood with the families' priors; about each linearisation scales are learnt, then the error of the model.
+//! Gauss-Newton on the fit's likelihood with the families' priors; about each linearisation scales are learnt, that of the family first which gains most, then the error
+//! of the model.
 
 use core::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -445,7 +446,8 @@ fn precision(families: &[Family], unknowns: usize) -> DMatrix<f64> {
     precision
 }
 
-/// Groups of the fit and the magnets of each name, which have a supply or a design in common; with a gradient in each dipole, sextupole and quadrupole of a group, and a skew gradient in each magnet, where the fit has none.
+/// Groups of the fit, and those that have a factor in common; a gradient in each dipole, sextupole, straight and quadrupole of a group, and a skew gradient in each
+/// magnet, where the fit has none; straights.
 fn everything(folder: &Folder, fitted: &Groups) -> Groups {
     let [mut strengths, mut skews, mut gradients, _] = fitted.clone();
     let is_magnet = |row: &Row| row.k1 != 0.0 || row.bend != 0.0 || row.half_k2 != 0.0;

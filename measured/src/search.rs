@@ -142,6 +142,13 @@ pub struct Search {
     pub limits: Vec<(usize, [f64; 2])>,
 }
 
+impl Search {
+    /// Numbers of what stands out.
+    pub fn unknowns(&self) -> Vec<usize> {
+        self.outliers.iter().map(|outlier| outlier.unknown).collect()
+    }
+}
+
 /// Everything that stands out of its family.
 ///
 /// # Errors
