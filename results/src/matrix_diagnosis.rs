@@ -209,7 +209,7 @@ fn beside(amplitude: f64, sigma: f64) -> String {
 }
 
 /// A number as people read it.
-fn number(value: f64, unit: &str) -> String {
+pub(crate) fn number(value: f64, unit: &str) -> String {
     match unit {
         "1/m" | "1/m^2" => format!("{value:.5} {}", &unit[1..]),
         _ => format!("{:.2} %", 1e2 * value),
@@ -396,10 +396,11 @@ impl fmt::Display for MatrixDiagnosis {
             1e3 * after.heldout_rms_mm
         );
         writeln!(f, "{}\n", fill(&predicted))?;
-        let mut rows = table(["ordinary", "of", "members", "mean", "scatter", "sigma of one"]);
+        let mut rows = table(["ordinary", "members", "mean", "scatter", "sigma of one"]);
         for one in &self.imperfections {
             let numbers = [one.mean, one.scatter, one.sigma].map(|value| number(value, one.unit));
-            rows.add_row([one.kind.into(), one.at.clone(), one.members.to_string()].into_iter().chain(numbers));
+            let what = format!("{} of {}", one.kind, one.at);
+            rows.add_row([what, one.members.to_string()].into_iter().chain(numbers));
         }
         write!(f, "{rows}")?;
         if self.unexplained.is_empty() {

@@ -6,8 +6,8 @@ use measured::{Fit, Folder, Kind, unknowns};
 use report::{Axes, Band, Figure, Look, Magnet, Map, Page, Reference, Section, Series, Spotted, Strip, Symbol, Table};
 use twin::{Hold, Optics, OrbitError, Plane, Ring, Twiss};
 
-use crate::matrix_diagnosis::{ImperfectionResult, MatrixDiagnosis, MatrixFinding};
-use crate::matrix_result::{Comparison, MatrixFit};
+use crate::matrix_diagnosis::{ImperfectionResult, MatrixDiagnosis, MatrixFinding, number};
+use crate::matrix_result::{Comparison, MatrixFit, Row, rows};
 
 /// Elements of a matrix up to which each is drawn: more are too small to be seen.
 const DRAWN: usize = 2500;
@@ -333,11 +333,7 @@ fn findings(found: &MatrixDiagnosis) -> Section {
         rows: found.findings.iter().map(row).collect(),
     };
     let ordinary = |one: &ImperfectionResult| {
-        let number = |value: f64| match one.unit {
-            "1/m" | "1/m^2" => format!("{value:.5} {}", &one.unit[1..]),
-            _ => format!("{:.2} %", 1e2 * value),
-        };
-        let numbers = [one.mean, one.scatter, one.sigma].map(number);
+        let numbers = [one.mean, one.scatter, one.sigma].map(|value| number(value, one.unit));
         [one.kind.to_owned(), one.at.clone(), one.members.to_string()].into_iter().chain(numbers).collect()
     };
     let families = Table {
@@ -367,36 +363,36 @@ fn findings(found: &MatrixDiagnosis) -> Section {
 
 /// The report of a comparison.
 pub fn page_of(compared: &Comparison, [before, after]: [&str; 2]) -> Page {
-    let names: Vec<String> = compared.changes.iter().map(|one| one.name.clone()).collect();
+    let families = compared.families();
+    let told: Vec<Row> = families.iter().flat_map(|family| rows(family)).collect();
+    let names: Vec<String> = told.iter().map(|row| row.name.to_owned()).collect();
+    let percent: Vec<[f64; 2]> = told.iter().map(|row| row.change().map(|share| 1e2 * share)).collect();
     let interval = |widths: f64| {
-        let one = move |one: &crate::matrix_result::ChangeOfOne| {
-            let (change, width) = (100.0 * one.relative, 100.0 * widths * one.sigma);
-            (change - width, change + width)
-        };
-        compared.changes.iter().map(one).collect()
+        percent.iter().map(|[change, sigma]| (change - widths * sigma, change + widths * sigma)).collect()
     };
     let band = Band {
         label: "change".into(),
-        centre: compared.changes.iter().map(|one| 100.0 * one.relative).collect(),
+        centre: percent.iter().map(|[change, _]| *change).collect(),
         inner: interval(1.0),
         outer: interval(WITHIN_95),
     };
     let axes = Axes::new("What changed", "quadrupole", "relative change [%]").named(&names);
     let figure = Figure::bands(&axes.compared(Reference::Level(0.0)), &[band]);
     let word = |is: bool| if is { "yes" } else { "no" }.to_owned();
-    let row = |one: &crate::matrix_result::ChangeOfOne| {
-        let change = format!("{:+.3} ± {:.3}", 100.0 * one.relative, 100.0 * one.sigma);
-        vec![one.name.clone(), change, word(one.changed), word(one.identifiable)]
+    let row = |(row, [change, sigma]): (&Row, &[f64; 2])| {
+        let first = row.magnets[0];
+        let change = format!("{change:+.3} ± {sigma:.3}");
+        vec![row.name.to_owned(), change, word(first.changed), word(first.identifiable)]
     };
     let table = Table {
         caption:
-            "Changed: by more than chance. Can be told: the measurements decide, and not what was expected beforehand."
+            "Magnets of one name that changed alike are one row. Changed: by more than chance. Can be told: the measurements decide, and not what was expected beforehand."
                 .into(),
         header: ["quadrupole", "change [%]", "changed", "can be told"].map(str::to_owned).to_vec(),
-        rows: compared.changes.iter().map(row).collect(),
+        rows: told.iter().zip(&percent).map(row).collect(),
     };
     let others = Table {
-        caption: "Cables, gains, couplings and skew gradients that changed.".into(),
+        caption: "What changed beside them: cables, instruments, and fields of other elements; of a whole family the rms of its members.".into(),
         header: vec!["what".into()],
         rows: compared.others.iter().map(|one| vec![one.to_string()]).collect(),
     };

@@ -370,14 +370,14 @@ impl fmt::Display for OtherChange {
 const SAID: usize = 4;
 
 /// Magnets of one family that changed alike, or one that did not.
-struct Row<'c> {
-    name: &'c str,
-    magnets: &'c [&'c ChangeOfOne],
+pub(crate) struct Row<'c> {
+    pub(crate) name: &'c str,
+    pub(crate) magnets: &'c [&'c ChangeOfOne],
 }
 
 impl Row<'_> {
     /// The mean of the magnets, whose errors are those of their family.
-    fn change(&self) -> [f64; 2] {
+    pub(crate) fn change(&self) -> [f64; 2] {
         let mean = |of: fn(&ChangeOfOne) -> f64| {
             self.magnets.iter().map(|one| of(one)).sum::<f64>() / self.magnets.len() as f64
         };
@@ -435,7 +435,7 @@ impl Comparison {
     }
 
     /// Magnets family by family, in the order of the ring.
-    fn families(&self) -> Vec<Vec<&ChangeOfOne>> {
+    pub(crate) fn families(&self) -> Vec<Vec<&ChangeOfOne>> {
         let mut families: Vec<Vec<&ChangeOfOne>> = Vec::new();
         for one in &self.changes {
             match families.iter_mut().find(|family| family[0].family == one.family) {
@@ -448,7 +448,7 @@ impl Comparison {
 }
 
 /// One row of a family whose magnets changed alike, else one a magnet.
-fn rows<'c>(family: &'c [&'c ChangeOfOne]) -> Vec<Row<'c>> {
+pub(crate) fn rows<'c>(family: &'c [&'c ChangeOfOne]) -> Vec<Row<'c>> {
     match Row::is_alike(family) && family.len() > 1 {
         true => vec![Row { name: &family[0].family, magnets: family }],
         false => family.chunks(1).map(|one| Row { name: &one[0].name, magnets: one }).collect(),
