@@ -20,8 +20,14 @@ pub(super) fn value(lattice: &Lattice) -> Value {
     }}});
     let names = lattice.elements.iter().map(|element| json!(element.name));
     let line: Vec<Value> = core::iter::once(begin).chain(names).collect();
-    let about =
-        json!({"label": lattice.machine, "description": lattice.remarks_of("PALS", lattice.not_acted_on()).join("\n")});
+    let mut remarks = lattice.remarks_of("PALS", lattice.not_acted_on());
+    remarks.extend(lattice.elements.iter().filter_map(|element| match element.kind {
+        Kind::Wiggler { focusing } => {
+            Some(format!("PALS does not act on the vertical focusing of {}, {focusing} /m", element.name))
+        }
+        _ => None,
+    }));
+    let about = json!({"label": lattice.machine, "description": remarks.join("\n")});
     let ring = json!({"ring": {"kind": "BeamLine", "periodic": true, "line": line, "MetaP": about}});
     let whole = json!({"lattice": {"kind": "Lattice", "branches": ["ring"]}});
     let elements = (0..lattice.elements.len()).map(|at| element(lattice, at));
@@ -34,7 +40,8 @@ fn element(lattice: &Lattice, at: usize) -> Value {
     let element = &lattice.elements[at];
     let (kind, groups) = match &element.kind {
         Kind::Drift => ("Drift", json!({})),
-        Kind::Marker => ("Marker", json!({})),
+        // a format without a lens that focuses in one plane has its place
+        Kind::Marker | Kind::Wiggler { .. } => ("Marker", json!({})),
         Kind::Monitor => ("Instrument", json!({})),
         Kind::Corrector { .. } => ("Kicker", magnet(json!({"Kn0L": 0.0, "Ks0L": 0.0}))),
         Kind::Quadrupole { k1 } => ("Quadrupole", magnet(json!({"Kn1": k1}))),
@@ -42,7 +49,6 @@ fn element(lattice: &Lattice, at: usize) -> Value {
         Kind::Multipole { k1l, k1sl, k2l, k3l } => {
             ("Multipole", magnet(json!({"Kn1L": k1l, "Ks1L": k1sl, "Kn2L": k2l, "Kn3L": k3l})))
         }
-        Kind::Wiggler { focusing } => ("Wiggler", json!({"MetaP": {"vertical_focusing": focusing}})),
         Kind::Solenoid { ks } => ("Solenoid", json!({"SolenoidP": {"Ksol": ks}})),
         Kind::Bend(bend) => {
             let field = if bend.k2 == 0.0 { json!({"Kn1": bend.k1}) } else { json!({"Kn1": bend.k1, "Kn2": bend.k2}) };
