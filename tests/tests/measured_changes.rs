@@ -56,10 +56,12 @@ fn supplies_that_were_changed_are_found() {
         let product = mean(&|pair| (pair.0 - found) * (pair.1 - truth));
         let squares = [mean(&|pair| (pair.0 - found).powi(2)), mean(&|pair| (pair.1 - truth).powi(2))];
         let correlation = product / (squares[0] * squares[1]).sqrt();
+        let pull = |one: &Change| ((one.relative - set(&key, one)) / one.sigma).powi(2);
         println!(
-            "{name}: correlation {correlation:.3}, size {:.2}, common shift {:+.3} %",
+            "{name}: correlation {correlation:.3}, size {:.2}, common shift {:+.3} %, mean square pull {:.1}",
             product / squares[1],
-            1e2 * (found - truth)
+            1e2 * (found - truth),
+            changes.gradients.iter().map(pull).sum::<f64>() / n
         );
         assert!(correlation > 0.97, "{name}: {correlation}");
         // a change that was told, of a supply that was changed by more than what is told of all of them
