@@ -12,7 +12,7 @@
 //! let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/measured/imports/twelve-cells.at.json");
 //! let lattice = Lattice::read(file.as_ref())?;
 //! let instruments = Instruments::choose(&lattice, &["bpm*".parse()?], &["cor*".parse()?])?;
-//! let ring: Ring = measured::lattice::ring(&bare(&lattice, &instruments)?, &[])?;
+//! let ring: Ring = measured::lattice::ring(&bare(&lattice, &instruments)?, &[], &[])?;
 //! let text = export::text(&export::Lattice::plain(&ring), Format::Madx);
 //! assert!(text.contains("use, sequence = ring;"));
 //! # Ok::<(), Box<dyn core::error::Error>>(())
