@@ -116,7 +116,7 @@ pub fn conceal(
 
 fn gain_of_cable(folder: &Folder, changed: &Folder, fitted: &Fit) -> f64 {
     let change = (&changed.matrix - &folder.matrix).map(|x| if x.is_finite() { x } else { 0.0 });
-    let information = fitted.data.information(&fitted.missed);
+    let information = fitted.data.information(&fitted.noise);
     0.5 * change.component_mul(&change).dot(&information.columns(0, change.ncols()))
 }
 

@@ -6,6 +6,7 @@ use twin::Plane;
 use crate::folder::{Flags, Folder};
 use crate::missed::Missed;
 use crate::model::Prediction;
+use crate::noise::Noise;
 
 /// Monitors' plane and correctors' plane, or the dispersion in a plane.
 pub const BLOCKS: [&str; 6] = ["x to H", "x to V", "y to H", "y to V", "x to RF", "y to RF"];
@@ -69,34 +70,50 @@ impl Data {
 
     /// One over the square of the stated noise of each element [1/mm^2].
     pub fn stated(&self) -> DMatrix<f64> {
-        self.precision(&[Missed::NOTHING; 6])
+        self.sigma.map(|sigma| sigma.powi(-2))
     }
 
-    /// The same with what the model misses in each block.
-    pub fn precision(&self, missed: &[Missed; 6]) -> DMatrix<f64> {
-        self.each(missed, |missed, sigma| missed.spread(sigma).powi(-2))
+    /// The same with the errors of the elements.
+    pub fn precision(&self, noise: &Noise) -> DMatrix<f64> {
+        self.each(noise, |block, sigma, _| block.spread(sigma).powi(-2), None)
     }
 
     /// What each element counts [1/mm^2], the less the further it is off.
-    pub fn weight(&self, missed: &[Missed; 6], residual: &DMatrix<f64>) -> DMatrix<f64> {
-        DMatrix::from_fn(residual.nrows(), residual.ncols(), |i, j| {
-            missed[self.block[(i, j)]].weight(self.sigma[(i, j)], residual[(i, j)])
-        })
+    pub fn weight(&self, noise: &Noise, residual: &DMatrix<f64>) -> DMatrix<f64> {
+        self.each(noise, Missed::weight, Some(residual))
     }
 
     /// What each element says on average [1/mm^2].
-    pub fn information(&self, missed: &[Missed; 6]) -> DMatrix<f64> {
-        self.each(missed, Missed::information)
+    pub fn information(&self, noise: &Noise) -> DMatrix<f64> {
+        self.each(noise, |block, sigma, _| block.information(sigma), None)
     }
 
     /// `ln` of the likelihood of residuals [mm].
-    pub fn log_likelihood(&self, missed: &[Missed; 6], residual: &DMatrix<f64>) -> f64 {
-        let elements = self.sigma.iter().zip(&self.block).zip(residual).filter(|((sigma, _), _)| sigma.is_finite());
-        elements.map(|((&sigma, &block), &residual)| missed[block].log_likelihood(sigma, residual)).sum()
+    pub fn log_likelihood(&self, noise: &Noise, residual: &DMatrix<f64>) -> f64 {
+        let elements = (0..residual.ncols()).flat_map(|column| (0..residual.nrows()).map(move |row| (row, column)));
+        let counted = elements.filter(|&at| self.sigma[at].is_finite());
+        counted.map(|at| self.log_density(noise, at, residual[at])).sum()
     }
 
-    fn each(&self, missed: &[Missed; 6], of: impl Fn(&Missed, f64) -> f64) -> DMatrix<f64> {
-        self.sigma.zip_map(&self.block, |sigma, block| of(&missed[block], sigma))
+    /// The same of the residual [mm] of one element.
+    pub fn log_density(&self, noise: &Noise, at: (usize, usize), residual: f64) -> f64 {
+        let scale = noise.monitors[at.0];
+        noise.blocks[self.block[at]].log_likelihood(self.sigma[at], residual / scale) - scale.ln()
+    }
+
+    /// A precision of each element, from one of its block at the residual in units of its monitor's scale.
+    fn each(
+        &self,
+        noise: &Noise,
+        precision: impl Fn(&Missed, f64, f64) -> f64,
+        residual: Option<&DMatrix<f64>>,
+    ) -> DMatrix<f64> {
+        let (rows, columns) = self.sigma.shape();
+        DMatrix::from_fn(rows, columns, |row, column| {
+            let (at, scale) = ((row, column), noise.monitors[row]);
+            let residual = residual.map_or(0.0, |residual| residual[at] / scale);
+            precision(&noise.blocks[self.block[at]], self.sigma[at], residual) / (scale * scale)
+        })
     }
 
     /// Sum of squares over the stated noise.
@@ -147,7 +164,7 @@ mod tests {
         let fitted = fit(&measured(&ring, &truth, NOISE, 2), &Settings::default(), &mut |_| ()).unwrap();
         // 12 monitors and 12 correctors a plane, and the dispersion of both
         assert_eq!(fitted.elements, 2 * 12 * 12 + 24);
-        assert!(fitted.missed[1].scale == 0.0 && fitted.missed[2].scale == 0.0);
+        assert!(fitted.noise.blocks[1].scale == 0.0 && fitted.noise.blocks[2].scale == 0.0);
         // what the couplings do in the blocks of one plane is of second order
         assert!(fitted.chi2_loco < 2.0, "{}", fitted.chi2_loco);
     }

@@ -309,7 +309,7 @@ impl Finding {
     fn of_cable(folder: &Folder, hierarchy: &Hierarchy, data: &Data, cable: &Wiring) -> Self {
         let (word, at) = cable.named(folder);
         let gain = cable.squares(folder, &hierarchy.prediction.matrix, |row, column| {
-            hierarchy.missed[data.block[(row, column)]].spread(folder.monitors[row].sigma)
+            hierarchy.noise.blocks[data.block[(row, column)]].spread(folder.monitors[row].sigma)
         }) / 2.0;
         let (what, s, probability) = (What::Cable(cable.clone()), None, certain(gain));
         Self { what, word, at, s, amplitude: 1.0, sigma: 0.0, gain, probability, alternatives: Vec::new() }
@@ -394,7 +394,7 @@ fn as_loco(folder: &Folder, fitted: &Fit, settings: &Settings) -> Result<HeldOut
         prediction: &prediction,
         precision: &DMatrix::identity(n, n),
         pull: &pull,
-        missed: &fitted.missed,
+        noise: &fitted.noise,
         width: &width,
     };
     HeldOut::of_fit(&fitted.data, &fit)
@@ -413,7 +413,7 @@ fn with_families(hierarchy: &Hierarchy, fitted: &Fit) -> Result<HeldOut, Measure
         prediction: &hierarchy.prediction,
         precision: &precision,
         pull: &pull,
-        missed: &hierarchy.missed,
+        noise: &hierarchy.noise,
         width: &width,
     };
     HeldOut::of_fit(&fitted.data, &fit)
@@ -422,7 +422,8 @@ fn with_families(hierarchy: &Hierarchy, fitted: &Fit) -> Result<HeldOut, Measure
 /// Monitors' rows and correctors' columns whose residuals are larger than those of the others.
 fn unexplained(folder: &Folder, fitted: &Fit, hierarchy: &Hierarchy) -> Vec<Unexplained> {
     let (data, residual) = (&fitted.data, &hierarchy.residual);
-    let squares = residual.component_mul(residual).component_mul(&data.precision(&hierarchy.missed));
+    let squares =
+        residual.component_mul(residual).component_mul(&data.precision(&hierarchy.noise.with_equal_monitors()));
     let (sum, elements) = (squares.sum(), data.elements() as f64);
     let judge = |at: String, squares: f64, residual: f64, n: usize| {
         let others = (sum - squares) / (elements - n as f64);

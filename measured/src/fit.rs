@@ -15,8 +15,8 @@ use crate::data::Data;
 use crate::descent::{Descent, descend};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
-use crate::missed::Missed;
-use crate::model::{Model, Prediction};
+use crate::model::Model;
+use crate::noise::Noise;
 use crate::normal::Places;
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Unknown, Widths, groups, unknowns};
@@ -60,8 +60,8 @@ pub struct Fit {
     pub outliers: Vec<[usize; 2]>,
     /// What was fitted, without the outliers.
     pub data: Data,
-    /// What the model misses in each of [`crate::data::BLOCKS`].
-    pub missed: [Missed; 6],
+    /// Errors of the elements.
+    pub noise: Noise,
     /// Measured less predicted [mm], with the dispersion as the last column; 0 where nothing counts.
     pub residual: DMatrix<f64>,
     /// The same of the fit with the stated noise alone.
@@ -74,8 +74,6 @@ pub struct Fit {
 
 /// Rounds of the model's error.
 const ROUNDS: usize = 6;
-/// Of an element that the unknowns follow further than this, what is left tells nothing of its error.
-const LEAST_LEFT: f64 = 0.1;
 
 /// Fit a measurement.
 ///
@@ -122,7 +120,7 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     let chi2_loco = data.chi2(&as_stated.prediction) / elements as f64;
     let stated_residual = data.residual(&as_stated.prediction);
     let steps = as_stated.steps;
-    let Learnt { here, missed, uncertainty } = with_model_error(&model, &unknowns, &data, as_stated, progress)?;
+    let Learnt { here, noise, uncertainty } = with_model_error(&model, &unknowns, &data, as_stated, progress)?;
     Ok(Fit {
         groups,
         chi2_loco,
@@ -131,7 +129,7 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
         outliers,
         residual: data.residual(&here.prediction),
         data,
-        missed,
+        noise,
         stated_residual,
         steps: steps + here.steps,
         has_ended: here.has_ended,
@@ -152,50 +150,28 @@ pub fn with_model_error(
     from: Descent,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Learnt, MeasuredError> {
-    let (mut here, mut missed, mut steps) = (from, [Missed::NOTHING; 6], 0);
+    let (mut here, mut noise, mut steps) = (from, Noise::stated(data.measured.nrows()), 0);
     for round in 1..=ROUNDS {
         progress(&format!("error of the model, round {round} of {ROUNDS}"));
         let residual = data.residual(&here.prediction);
         let places = Places::of(unknowns, residual.nrows(), residual.ncols());
-        missed = learn_missed(data, &places, &here.prediction, (&residual, &here.covariance), &missed);
-        let weight = data.weight(&missed, &residual);
+        noise = noise.learnt(data, &places, &here.prediction, (&residual, &here.covariance));
+        let weight = data.weight(&noise, &residual);
         here = descend(model, unknowns, &data.measured, &weight, here.values)?;
         steps += here.steps;
     }
-    let uncertainty = Uncertainty::of(unknowns, &here.prediction, data, &missed)?;
-    Ok(Learnt { here: Descent { steps, ..here }, missed, uncertainty })
+    let uncertainty = Uncertainty::of(unknowns, &here.prediction, data, &noise)?;
+    Ok(Learnt { here: Descent { steps, ..here }, noise, uncertainty })
 }
 
 /// A descent with what the model misses.
 pub struct Learnt {
     /// Where it ended.
     pub here: Descent,
-    /// What the model misses in each of [`crate::data::BLOCKS`].
-    pub missed: [Missed; 6],
+    /// Errors of the elements.
+    pub noise: Noise,
     /// How well the unknowns are known.
     pub uncertainty: Uncertainty,
-}
-
-/// What the model misses in each block, from residuals [mm] that are as large as the errors that they are left of: unknowns of some covariance follow
-/// each element with a share `h` of it, its weight times the variance that their covariance gives it, and leave `1 - h` of its variance.
-///
-/// Source: D. A. Belsley, E. Kuh and R. E. Welsch, Regression Diagnostics (1980), eq. 2.15.
-pub fn learn_missed(
-    data: &Data,
-    places: &Places,
-    prediction: &Prediction,
-    (residual, covariance): (&DMatrix<f64>, &DMatrix<f64>),
-    missed: &[Missed; 6],
-) -> [Missed; 6] {
-    let followed = places.variance(prediction, covariance).component_mul(&data.weight(missed, residual));
-    let errors = residual.zip_map(&followed, |residual, followed| residual / (1.0 - followed).max(LEAST_LEFT).sqrt());
-    let mut of_block: [Vec<(f64, f64)>; 6] = Default::default();
-    for ((&block, &sigma), &error) in data.block.iter().zip(&data.sigma).zip(&errors) {
-        if sigma.is_finite() {
-            of_block[block].push((error, sigma));
-        }
-    }
-    of_block.map(|elements| Missed::of(&elements))
 }
 
 impl Fit {
@@ -206,7 +182,7 @@ impl Fit {
 
     /// Squares of the residuals over those of their scales: as an error has heavy tails, more than 1 on average.
     pub fn squares(&self) -> DMatrix<f64> {
-        self.residual.component_mul(&self.residual).component_mul(&self.data.precision(&self.missed))
+        self.residual.component_mul(&self.residual).component_mul(&self.data.precision(&self.noise))
     }
 
     /// Sets of unknowns that the measurement cannot tell apart: each is known less well than half its prior, and follows another one by a
@@ -262,7 +238,7 @@ mod tests {
             // the square of noise and model's error is known to 12 % from the 144 elements of a block, to 41 % from 12 of the dispersion; four
             // such errors
             let limits = [0.7, 0.7, 0.7, 0.7, 1.3, 1.3].map(|limit| limit * NOISE);
-            assert!(fit.missed.iter().zip(limits).all(|(one, limit)| one.scale < limit), "{:?}", fit.missed);
+            assert!(fit.noise.blocks.iter().zip(limits).all(|(one, limit)| one.scale < limit), "{:?}", fit.noise);
         }
         // 96 strengths: their mean square scatters by 0.14
         let mean = all.iter().map(nees).sum::<f64>() / 4.0;
@@ -354,7 +330,7 @@ mod tests {
     #[test]
     fn what_the_model_misses_is_learnt() {
         let all: Vec<_> = (0..8).map(|seed| fitted(5.0 * NOISE, seed)).collect();
-        let of_blocks = all.iter().flat_map(|(fit, _)| fit.missed.iter().take(4));
+        let of_blocks = all.iter().flat_map(|(fit, _)| fit.noise.blocks.iter().take(4));
         let (scales, freedoms): (Vec<f64>, Vec<f64>) = of_blocks.map(|one| (one.scale, one.freedom)).unzip();
         // 32 blocks of 144 elements, a quarter of them for the unknowns: each known to 7 %, their mean to 1.2 %; four times that
         let mean = scales.iter().sum::<f64>() / 32.0;
@@ -380,7 +356,7 @@ mod tests {
             .collect();
         let nees = all.iter().map(nees).sum::<f64>() / 8.0;
         assert!((0.6..1.4).contains(&nees), "NEES {nees}");
-        let tailed = all.iter().flat_map(|(fit, _)| fit.missed.iter().take(4)).filter(|one| one.freedom < 5.0);
+        let tailed = all.iter().flat_map(|(fit, _)| fit.noise.blocks.iter().take(4)).filter(|one| one.freedom < 5.0);
         // 144 elements with two degrees of freedom have gained 25 nat over normal ones on average
         assert!(tailed.count() > 28);
     }

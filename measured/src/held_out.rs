@@ -5,8 +5,8 @@ use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::missed::Missed;
 use crate::model::Prediction;
+use crate::noise::Noise;
 use crate::normal::{Normal, Places, times};
 
 /// Parts of the rows, and of the columns.
@@ -46,8 +46,8 @@ pub struct Fitted<'f> {
     pub precision: &'f DMatrix<f64>,
     /// Slope of `-ln` prior at its values.
     pub pull: &'f DVector<f64>,
-    /// What the model misses.
-    pub missed: &'f [Missed; 6],
+    /// Errors of the elements.
+    pub noise: &'f Noise,
     /// Widths of its unknowns, in which the precision is.
     pub width: &'f DVector<f64>,
 }
@@ -58,9 +58,9 @@ impl HeldOut {
     /// # Errors
     /// [`MeasuredError::Singular`].
     pub fn of_fit(data: &Data, fit: &Fitted) -> Result<Self, MeasuredError> {
-        let Fitted { places, prediction, precision, pull, missed, width } = fit;
+        let Fitted { places, prediction, precision, pull, noise, width } = fit;
         let residual = data.residual(prediction);
-        let weight = data.weight(missed, &residual);
+        let weight = data.weight(noise, &residual);
         let (rows, columns) = residual.shape();
         let part = |count: usize, part: usize| (part..count).step_by(PARTS).collect::<Vec<usize>>();
         let parts = (0..PARTS * PARTS).map(|number| [part(rows, number / PARTS), part(columns, number % PARTS)]);
@@ -85,11 +85,7 @@ impl HeldOut {
         }
         let density = |column: usize| {
             let counted = (0..rows).filter(|&row| data.sigma[(row, column)].is_finite());
-            counted
-                .map(|row| {
-                    missed[data.block[(row, column)]].log_likelihood(data.sigma[(row, column)], left[(row, column)])
-                })
-                .sum()
+            counted.map(|row| data.log_density(noise, (row, column), left[(row, column)])).sum()
         };
         let elements = data.elements() as f64;
         Ok(Self {
@@ -135,11 +131,11 @@ mod tests {
             prediction: &prediction,
             precision: &DMatrix::identity(n, n),
             pull: &DVector::from_iterator(n, each.map(|(one, value)| (value - one.mean) / one.width)),
-            missed: &fitted.missed,
+            noise: &fitted.noise,
             width: &DVector::from_iterator(n, fitted.unknowns.iter().map(|one| one.width)),
         };
         let found = HeldOut::of_fit(&fitted.data, &fit).unwrap();
-        let weight = fitted.data.weight(&fitted.missed, &fitted.residual);
+        let weight = fitted.data.weight(&fitted.noise, &fitted.residual);
         let mut squares = 0.0;
         for part in 0..PARTS * PARTS {
             let is_out = |row: usize, column: usize| row % PARTS == part / PARTS && column % PARTS == part % PARTS;

@@ -13,10 +13,10 @@ use nalgebra::{Cholesky, DMatrix, DVector};
 use crate::data::Data;
 use crate::error::MeasuredError;
 use crate::family::{Family, Marginal, ORDINARY, UNCHANGED, class, families, sort};
-use crate::fit::{Fit, Settings, learn_missed};
+use crate::fit::{Fit, Settings};
 use crate::folder::{Folder, Row};
-use crate::missed::Missed;
 use crate::model::{Model, Prediction};
+use crate::noise::Noise;
 use crate::normal::{Normal, Places, inverse, times};
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
@@ -51,8 +51,8 @@ pub struct Hierarchy {
     pub families: Vec<Family>,
     /// Posterior about the last linearisation.
     pub posterior: Posterior,
-    /// What the model misses in each block.
-    pub missed: [Missed; 6],
+    /// Errors of the elements.
+    pub noise: Noise,
     /// Measured less predicted [mm].
     pub residual: DMatrix<f64>,
     /// How well the values are known where errors are alike along rows and columns.
@@ -174,7 +174,7 @@ impl Hierarchy {
         }
         let model = Model::of(folder, &groups, settings.rf)?;
         let classes = unknowns.iter().map(|unknown| class(folder, &groups, unknown.kind)).collect();
-        let start = Start { groups, unknowns, values, classes, families, missed: fitted.missed };
+        let start = Start { groups, unknowns, values, classes, families, noise: fitted.noise.clone() };
         start.settle(&model, &fitted.data, ROUNDS, progress)
     }
 
@@ -195,8 +195,8 @@ impl Hierarchy {
             let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
             (family.mean, family.scale) = known.map_or((family.mean, family.scale), |one| (one.mean, one.scale));
         }
-        let Self { groups, unknowns, values, classes, missed, .. } = self;
-        let start = Start { groups, unknowns, values, classes, families, missed };
+        let Self { groups, unknowns, values, classes, noise, .. } = self;
+        let start = Start { groups, unknowns, values, classes, families, noise };
         start.settle(model, data, ROUNDS / 2, progress)
     }
 
@@ -213,8 +213,8 @@ impl Hierarchy {
         let about = self.unknowns.iter().zip(&self.values);
         let unknowns: Vec<Unknown> = about.map(|(unknown, &mean)| Unknown { mean, ..*unknown }).collect();
         let families = families(folder, &self.groups, &unknowns, &[], UNCHANGED);
-        let Self { groups, values, classes, missed, .. } = self.clone();
-        let start = Start { groups, unknowns, values, classes, families, missed };
+        let Self { groups, values, classes, noise, .. } = self.clone();
+        let start = Start { groups, unknowns, values, classes, families, noise };
         start.settle(model, data, ROUNDS, progress)
     }
 
@@ -296,7 +296,7 @@ struct Start {
     values: DVector<f64>,
     classes: Vec<String>,
     families: Vec<Family>,
-    missed: [Missed; 6],
+    noise: Noise,
 }
 
 /// The likelihood about some values, with distances in widths of the priors.
@@ -346,7 +346,7 @@ impl Start {
                 family.mean += family.deviations(&posterior.values, &posterior.covariance).mean;
             }
             let (left, covariance) = (data.residual(&prediction), times(posterior.covariance, &scene.width));
-            self.missed = learn_missed(data, &scene.places, &prediction, (&left, &covariance), &self.missed);
+            self.noise = self.noise.learnt(data, &scene.places, &prediction, (&left, &covariance));
             if gained + promised < SETTLED {
                 break;
             }
@@ -356,8 +356,8 @@ impl Start {
         let covariance = times(posterior.covariance.clone(), &scene.width);
         let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
         let uncertainty =
-            Uncertainty::about((&scene.places, &prediction), (covariance, information), (data, &self.missed));
-        let Self { groups, unknowns, values, classes, families, missed } = self;
+            Uncertainty::about((&scene.places, &prediction), (covariance, information), (data, &self.noise));
+        let Self { groups, unknowns, values, classes, families, noise } = self;
         let residual = here.residual;
         Ok(Hierarchy {
             groups,
@@ -366,7 +366,7 @@ impl Start {
             classes,
             families,
             posterior,
-            missed,
+            noise,
             residual,
             uncertainty,
             prediction,
@@ -376,7 +376,7 @@ impl Start {
     fn linearise(&self, scene: &Scene, prediction: &Prediction) -> Linearised {
         let n = self.unknowns.len();
         let residual = scene.data.residual(prediction);
-        let weight = scene.data.weight(&self.missed, &residual);
+        let weight = scene.data.weight(&self.noise, &residual);
         let normal = Normal::of(&scene.places, prediction, &residual, &weight, n);
         let expected = &scene.mean + means(&self.families, n).component_mul(&scene.width);
         Linearised {

@@ -51,12 +51,12 @@ impl Share {
         unknowns.insert(place, Unknown { kind: Kind::HeldFrequency, mean: believed, width: 1.0 });
         values.insert(place, believed);
         let (model, data) = (Model::of(folder, &fitted.groups, settings.rf)?, &fitted.data);
-        let weight = data.weight(&fitted.missed, &fitted.residual);
+        let weight = data.weight(&fitted.noise, &fitted.residual);
         let start = descend(&model, &unknowns, &data.measured, &weight, DVector::from_vec(values))?;
-        let Learnt { here, missed, uncertainty } = with_model_error(&model, &unknowns, data, start, progress)?;
+        let Learnt { here, noise, uncertainty } = with_model_error(&model, &unknowns, data, start, progress)?;
         let (value, scatter) = (here.values[place], uncertainty.sigma[place]);
-        let likelihoods = data.log_likelihood(&missed, &data.residual(&here.prediction))
-            - data.log_likelihood(&fitted.missed, &fitted.residual);
+        let likelihoods = data.log_likelihood(&noise, &data.residual(&here.prediction))
+            - data.log_likelihood(&fitted.noise, &fitted.residual);
         let gain = likelihoods - 0.5 * (value - believed).powi(2) + scatter.ln();
         Ok(Self {
             believed: settings.rf,

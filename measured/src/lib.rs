@@ -28,6 +28,7 @@ mod likeness;
 pub mod missed;
 pub mod model;
 pub mod named;
+pub mod noise;
 pub mod normal;
 pub mod raw;
 mod released;

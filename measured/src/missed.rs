@@ -65,7 +65,7 @@ impl Missed {
     }
 
     /// Most probable for a block's elements, each with its error and its stated noise [mm].
-    pub fn of(elements: &[(f64, f64)]) -> Self {
+    pub fn most_probable(elements: &[(f64, f64)]) -> Self {
         if elements.is_empty() {
             return Self::NOTHING;
         }
@@ -131,7 +131,7 @@ mod tests {
         for freedom in [2.0, 4.0, 1e9] {
             let noise = StudentT::new(freedom).unwrap();
             let elements: Vec<(f64, f64)> = (0..4000).map(|_| (0.02 * noise.sample(&mut random), 1e-4)).collect();
-            let missed = Missed::of(&elements);
+            let missed = Missed::most_probable(&elements);
             // 4000 elements tell the scale to 1.1 % sqrt((nu + 3)/nu) and 1/nu to about 0.015: four standard deviations
             assert!((missed.scale / 0.02 - 1.0).abs() < 0.07, "{missed:?}");
             assert!((1.0 / missed.freedom - 1.0 / freedom).abs() < 0.06, "{missed:?}");

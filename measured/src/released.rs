@@ -7,8 +7,8 @@
 use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
-use crate::missed::Missed;
 use crate::model::Prediction;
+use crate::noise::Noise;
 use crate::normal::Places;
 use crate::unknowns::Unknown;
 
@@ -21,7 +21,7 @@ pub struct Held<'f> {
     values: &'f DVector<f64>,
     at: &'f Prediction,
     data: &'f Data,
-    missed: &'f [Missed; 6],
+    noise: &'f Noise,
     covariance: &'f DMatrix<f64>,
     places: Places,
     residual: DMatrix<f64>,
@@ -42,17 +42,17 @@ impl<'f> Held<'f> {
     /// covariance with independent errors.
     pub fn of(
         (unknowns, values, at): (&'f [Unknown], &'f DVector<f64>, &'f Prediction),
-        (data, missed): (&'f Data, &'f [Missed; 6]),
+        (data, noise): (&'f Data, &'f Noise),
         covariance: &'f DMatrix<f64>,
     ) -> Self {
         let places = Places::of(unknowns, at.matrix.nrows(), at.matrix.ncols());
         let residual = data.residual(at);
-        let weighted = data.precision(missed).component_mul(&residual);
+        let weighted = data.precision(noise).component_mul(&residual);
         let mut slope = places.back(at, &weighted, unknowns.len());
         for ((slope, unknown), value) in slope.iter_mut().zip(unknowns).zip(values) {
             *slope += (unknown.mean - value) / unknown.width.powi(2);
         }
-        Self { unknowns, values, at, data, missed, covariance, places, residual, by_equal_weights: covariance * slope }
+        Self { unknowns, values, at, data, noise, covariance, places, residual, by_equal_weights: covariance * slope }
     }
 
     /// The same as [`Self::released`] to first order, with the weights of the fit or with equal ones, whichever goes further from a value: for a
@@ -82,14 +82,14 @@ impl<'f> Held<'f> {
             (weighted.dot(&self.residual) + prior) / (weighted.dot(&along) + stiff)
         };
         let further = |start: f64| {
-            let by = (0..STEPS).fold(start, |by, _| step(&self.data.weight(self.missed, &left(by))));
-            (by, self.data.log_likelihood(self.missed, &left(by)) + by * prior - 0.5 * by * by * stiff)
+            let by = (0..STEPS).fold(start, |by, _| step(&self.data.weight(self.noise, &left(by))));
+            (by, self.data.log_likelihood(self.noise, &left(by)) + by * prior - 0.5 * by * by * stiff)
         };
-        let [held, equal] = [0.0, step(&self.data.precision(self.missed))].map(further);
+        let [held, equal] = [0.0, step(&self.data.precision(self.noise))].map(further);
         let by = if equal.1 > held.1 { equal.0 } else { held.0 };
 
         let left = left(by);
-        let said = self.data.weight(self.missed, &left).component_mul(&left).component_mul(&along);
+        let said = self.data.weight(self.noise, &left).component_mul(&left).component_mul(&along);
         let lines = said.column_sum().norm_squared() + said.row_sum().norm_squared() - said.norm_squared();
         let widening = (lines * variance).max(1.0);
         Released { value: self.values[one] + by, sigma: self.sigma(one) * widening.sqrt() }

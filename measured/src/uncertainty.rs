@@ -16,8 +16,8 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::missed::Missed;
 use crate::model::Prediction;
+use crate::noise::Noise;
 use crate::normal::{Normal, Places, covariance};
 use crate::unknowns::Unknown;
 
@@ -37,27 +37,27 @@ pub struct Uncertainty {
 }
 
 impl Uncertainty {
-    /// About a prediction, with what the model misses.
+    /// About a prediction, with the errors of the elements.
     ///
     /// # Errors
     /// [`MeasuredError::Singular`].
-    pub fn of(unknowns: &[Unknown], at: &Prediction, data: &Data, missed: &[Missed; 6]) -> Result<Self, MeasuredError> {
+    pub fn of(unknowns: &[Unknown], at: &Prediction, data: &Data, noise: &Noise) -> Result<Self, MeasuredError> {
         let residual = data.residual(at);
         let places = Places::of(unknowns, residual.nrows(), residual.ncols());
         let nothing = DMatrix::zeros(residual.nrows(), residual.ncols());
-        let information = Normal::of(&places, at, &nothing, &data.information(missed), unknowns.len()).matrix;
+        let information = Normal::of(&places, at, &nothing, &data.information(noise), unknowns.len()).matrix;
         let independent = covariance(unknowns, information.clone())?;
-        Ok(Self::about((&places, at), (independent, information), (data, missed)))
+        Ok(Self::about((&places, at), (independent, information), (data, noise)))
     }
 
     /// About a prediction, with the covariance of the unknowns with independent errors and what the data say of them, `J^T W J`.
     pub fn about(
         (places, at): (&Places, &Prediction),
         (independent, information): (DMatrix<f64>, DMatrix<f64>),
-        (data, missed): (&Data, &[Missed; 6]),
+        (data, noise): (&Data, &Noise),
     ) -> Self {
         let (residual, n) = (data.residual(at), independent.nrows());
-        let slope = data.weight(missed, &residual).component_mul(&residual);
+        let slope = data.weight(noise, &residual).component_mul(&residual);
         let nothing = DMatrix::zeros(slope.nrows(), slope.ncols());
         let together = together(places, at, &slope, n);
         let alone = Normal::of(places, at, &nothing, &slope.component_mul(&slope), n).matrix;

@@ -139,7 +139,7 @@ impl MatrixFit {
             |&(_, i): &(usize, usize)| rows.iter().map(|&(_, j)| scale(i) * scale(j) * independent[(i, j)]).collect();
         let called = |at: usize| name(folder, &fit.groups, fit.unknowns[at].kind);
         let value = |at: usize| [fit.values[at], fit.sigma(at)];
-        let weight = fit.data.weight(&fit.missed, &fit.residual);
+        let weight = fit.data.weight(&fit.noise, &fit.residual);
         let chi2 = fit.residual.component_mul(&fit.residual).dot(&weight);
         Self {
             recording: folder.name.clone(),
@@ -210,7 +210,7 @@ fn model_error(fit: &Fit) -> Vec<BlockError> {
         let counted = elements.filter(|((of, sigma), _)| **of == block && sigma.is_finite());
         let mut residuals: Vec<f64> = counted.map(|(_, residual)| residual.abs()).collect();
         residuals.sort_by(f64::total_cmp);
-        let missed = fit.missed[block];
+        let missed = fit.noise.blocks[block];
         Some(BlockError {
             block: measured::data::BLOCKS[block],
             residual_um: 1e3 * residuals.get((0.68 * residuals.len() as f64) as usize)?,

@@ -303,8 +303,8 @@ fn of_instrument(folder: &Folder, fitted: &Fit, at: &Prediction, side: Side, one
     let scale = |&(i, j): &(usize, usize)| {
         let by_machine = |k: usize| if k < machine { at.by_machine[k][(i, j)] } else { 0.0 };
         let of_magnets = fitted.uncertainty.variance(&DVector::from_fn(fitted.values.len(), |k, _| by_machine(k)));
-        let missed = fitted.missed[fitted.data.block[(i, j)]];
-        (missed.spread(folder.monitors[i].sigma).hypot(of_magnets.sqrt()), missed.freedom)
+        let missed = fitted.noise.blocks[fitted.data.block[(i, j)]];
+        ((fitted.noise.monitors[i] * missed.spread(folder.monitors[i].sigma)).hypot(of_magnets.sqrt()), missed.freedom)
     };
     let (scale, freedom): (Vec<f64>, Vec<f64>) = elements.iter().map(scale).unzip();
     let n = elements.len();
