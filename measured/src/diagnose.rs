@@ -17,7 +17,7 @@ use crate::hierarchy::Hierarchy;
 use crate::hold::Share;
 use crate::model::Model;
 use crate::normal::Places;
-use crate::search::{NAMED, Outlier, Rival, Search, search};
+use crate::search::{NAMED, Outlier, Rival, Search, search, straights};
 use crate::straight::DEAD;
 use crate::unknowns::{Groups, Kind, name};
 use crate::wiring::Wiring;
@@ -195,12 +195,15 @@ impl Diagnosis {
         let hierarchy = Hierarchy::of_fit(folder, fitted, settings, progress)?;
         let model = Model::of(folder, &hierarchy.groups, settings.rf)?;
         let (mut hierarchy, found) = released(hierarchy, folder, (&fitted.data, &model), fitted.has_ended, progress)?;
+        let is_new = |straight: &Outlier| !found.unknowns().contains(&straight.unknown);
+        let straights: Vec<Outlier> = straights(&hierarchy).into_iter().filter(is_new).collect();
         progress("elements held out");
         let held_out = [as_loco(folder, fitted, settings)?, with_families(&hierarchy, fitted)?];
         // parts of the matrix that tell a value differently bear out no smaller error
         hierarchy.uncertainty.sigma.zip_apply(&held_out[1].jackknife, |sigma, scatter| *sigma = sigma.max(scatter));
         let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, &fitted.data, cable));
-        let members = found.outliers.iter().map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
+        let members =
+            found.outliers.iter().chain(&straights).map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
         let mut findings: Vec<Finding> = cables.chain(Finding::of_share(&share)).chain(members).collect();
         // what the whole ring does before what stands at a place
         let is_local = |finding: &Finding| !matches!(finding.what, What::Hold(_));

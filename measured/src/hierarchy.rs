@@ -193,7 +193,8 @@ impl Hierarchy {
         let mut families = families(folder, &self.groups, &self.unknowns, released, ordinary);
         for family in &mut families {
             let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
-            (family.mean, family.scale) = known.map_or((family.mean, family.scale), |one| (one.mean, one.scale));
+            let Some(known) = known else { continue };
+            (family.mean, family.scale, family.freedom) = (known.mean, known.scale, known.freedom);
         }
         let Self { groups, unknowns, values, classes, noise, .. } = self;
         let start = Start { groups, unknowns, values, classes, families, noise };
@@ -212,7 +213,10 @@ impl Hierarchy {
     ) -> Result<Self, MeasuredError> {
         let about = self.unknowns.iter().zip(&self.values);
         let unknowns: Vec<Unknown> = about.map(|(unknown, &mean)| Unknown { mean, ..*unknown }).collect();
-        let families = families(folder, &self.groups, &unknowns, &[], UNCHANGED);
+        let mut families = families(folder, &self.groups, &unknowns, &[], UNCHANGED);
+        // edges of dipoles do not change
+        let wigglers = families.iter_mut().filter(|family| family.kind == Kind::Wiggler(0).word());
+        wigglers.for_each(|family| family.freedom = 0.0);
         let Self { groups, values, classes, noise, .. } = self.clone();
         let start = Start { groups, unknowns, values, classes, families, noise };
         start.settle(model, data, ROUNDS, progress)

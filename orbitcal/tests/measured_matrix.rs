@@ -252,6 +252,6 @@ fn coupling_that_the_model_lacks_is_said() {
         groups.retain(|one| one["field"] == "K");
         std::fs::write(out.join("meta.json"), meta.to_string()).unwrap();
         let sentence = json(&["diagnose", out.to_str().unwrap()])["sentence"].to_string();
-        assert_eq!(sentence.contains("skew_gradient of"), expected, "{name}: {sentence}");
+        assert_eq!(sentence.contains("skew gradients in"), expected, "{name}: {sentence}");
     }
 }

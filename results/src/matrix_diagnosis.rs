@@ -178,9 +178,11 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
     let worse = (!worst.is_empty())
         .then(|| format!("readings of {} are explained worse than those of others", worst.join(", ")));
     let nothing = findings.is_empty() && fitted.has_ended;
-    let large = diagnosis.imperfections.iter().filter(|one| one.is_large()).map(|one| {
+    // straights that focus are findings, each by itself
+    let is_told = |one: &&Imperfection| one.is_large() && one.word != "wiggler_focusing";
+    let large = diagnosis.imperfections.iter().filter(is_told).map(|one| {
         let [scatter, ordinary] = [one.scatter, one.ordinary].map(|value| number(value, unit(one.word)));
-        format!("{} of {} scatters by {scatter}, in an ordinary ring by {ordinary}", one.word, one.class)
+        format!("{} scatter by {scatter}, in an ordinary ring by {ordinary}", members(one.word, &one.class))
     });
     let large: Vec<String> = if fitted.has_ended { large.collect() } else { Vec::new() };
     let parts: Vec<String> = (doubt.into_iter())
@@ -191,6 +193,21 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
         .chain(worse)
         .collect();
     parts.join("; ")
+}
+
+/// Members of a family.
+fn members(kind: &str, class: &str) -> String {
+    match (kind, class) {
+        ("bpm_gain", plane) => format!("gains of {plane} monitors"),
+        ("bpm_coupling", plane) => format!("couplings of {plane} monitors"),
+        ("corrector_gain", plane) => format!("kicks of {plane} correctors"),
+        ("corrector_coupling", plane) => format!("couplings of {plane} correctors"),
+        ("quadrupole_gradient", "families") => "strengths of supplies".to_owned(),
+        ("quadrupole_gradient", sort) => format!("strengths of {sort}"),
+        ("skew_gradient", sort) => format!("skew gradients in {sort}"),
+        ("wiggler_focusing", sort) => format!("vertical focusing strengths of {sort}"),
+        (_, sort) => format!("further gradients in {sort}"),
+    }
 }
 
 /// Unit of an amplitude.
@@ -296,7 +313,9 @@ fn member_sentence(kind: Kind, finding: &Finding) -> String {
         Kind::MonitorCoupling(_) => format!("{at} reads {size} of the other plane"),
         Kind::CorrectorCoupling(_) => format!("{at} kicks {size} of its kick in the other plane"),
         Kind::Strength(_) => format!("{at} is {size} off the strengths of its kind"),
-        _ => format!("{word} at {at} of {size}"),
+        Kind::Skew(_) => format!("{at} has a skew gradient of {size}"),
+        Kind::Wiggler(_) => format!("{at} focuses vertically by {size}, as a wiggler does"),
+        _ => format!("{at} has a gradient of {size} that the lattice has not"),
     };
     if finding.is_named() { said } else { format!("perhaps {said} (P {probability:.2})") }
 }
@@ -399,8 +418,7 @@ impl fmt::Display for MatrixDiagnosis {
         let mut rows = table(["ordinary", "members", "mean", "scatter", "sigma of one"]);
         for one in &self.imperfections {
             let numbers = [one.mean, one.scatter, one.sigma].map(|value| number(value, one.unit));
-            let what = format!("{} of {}", one.kind, one.at);
-            rows.add_row([what, one.members.to_string()].into_iter().chain(numbers));
+            rows.add_row([members(one.kind, &one.at), one.members.to_string()].into_iter().chain(numbers));
         }
         write!(f, "{rows}")?;
         if self.unexplained.is_empty() {
