@@ -155,6 +155,25 @@ fn what_one_half_of_the_correctors_names_the_other_names() {
     assert!(mean < 5.0, "mean square pull {mean}");
 }
 
+/// Where nothing was changed between two measurements, both name the same places, with amplitudes that agree; a wiggler that was closed is named.
+#[test]
+fn what_one_measurement_names_the_next_one_names() {
+    let (mut again, mut count, mut pulls) = (0, 0, Vec::new());
+    for name in ["null_1", "null_2", "null_3"] {
+        let Some(path) = measured_ring(&format!("uvx/{name}")) else { return };
+        let [before, after] = ["before", "after"]
+            .map(|state| diagnosed(&Folder::read(&path.join(state)).unwrap(), &Settings::default()).1);
+        let said = named_again(&before, &after);
+        println!("{name}: {} of {} again, pulls {:.2?}", said.0, said.1, said.2);
+        (again, count) = (again + said.0, count + said.1);
+        pulls.extend(said.2);
+    }
+    let mean = pulls.iter().map(|pull| pull * pull).sum::<f64>() / pulls.len() as f64;
+    println!("{again} of {count} again, mean square pull {mean:.2} of {}", pulls.len());
+    assert!(count > 0 && again as f64 >= 0.9 * f64::from(count as u32), "{again} of {count}");
+    assert!(mean < 1.6, "mean square pull {mean}");
+}
+
 /// An effect of a kind that one matrix shows, put into it: what was put in, with its oracle gain, the square of its size over twice the variance of what the data say
 /// and of what its family scatters [nat].
 fn injected(folder: &Folder, found: &Diagnosis, seed: u64) -> (Folder, &'static str, String, f64) {
