@@ -81,7 +81,6 @@ pub struct Before {
     pub folder: Folder,
     /// What was put right.
     pub cables: Vec<Wiring>,
-    data: Data,
     settings: Settings,
     /// Its fit with families.
     pub hierarchy: Hierarchy,
@@ -102,20 +101,20 @@ impl Before {
         let share = Share::of_fit(&folder, fitted, settings, progress)?;
         let (fitted, settings) = share.fitted(&folder, fitted, settings, progress)?;
         let hierarchy = Hierarchy::of_fit(&folder, &fitted, &settings, progress)?;
-        Ok(Self { folder, cables, data: fitted.data, settings, hierarchy })
+        Ok(Self { folder, cables, settings, hierarchy })
     }
 
     /// The second measurement less what the first fit left over of the first, with the noise of both.
     fn changed(&self, after: &Folder) -> Data {
-        let mut data = Data::of(after);
-        let residual = &self.hierarchy.residual;
+        let mut data = Data::with_coupling(after, &[]);
+        let Hierarchy { data: before, residual, .. } = &self.hierarchy;
         // what is left over grows with the kick
         let per_kick = |j: usize| match (self.folder.correctors.get(j), after.correctors.get(j)) {
             (Some(before), Some(after)) => after.kick / before.kick,
             _ => after.meta.delta_rf / self.folder.meta.delta_rf,
         };
         for (i, j) in (0..data.sigma.ncols()).flat_map(|j| (0..residual.nrows()).map(move |i| (i, j))) {
-            let both = (self.data.sigma[(i, j)] * per_kick(j)).hypot(data.sigma[(i, j)]);
+            let both = (before.sigma[(i, j)] * per_kick(j)).hypot(data.sigma[(i, j)]);
             let counts = both.is_finite();
             data.sigma[(i, j)] = if counts { both } else { f64::INFINITY };
             data.measured[(i, j)] = if counts { data.measured[(i, j)] - residual[(i, j)] * per_kick(j) } else { 0.0 };
@@ -133,8 +132,8 @@ impl Before {
         let (after, wiring) = straightened_by(&after, &self.folder.matrix);
         let model = Model::of(&self.folder, &self.hierarchy.groups, self.settings.rf)?.with_kicks(&after);
         let data = self.changed(&after);
-        let changed = self.hierarchy.of_changes(&self.folder, (&data, &model), progress)?;
-        let (changed, found) = released(changed, &self.folder, (&data, &model), true, progress)?;
+        let changed = self.hierarchy.of_changes(&self.folder, (data, &model), progress)?;
+        let (changed, found) = released(changed, &self.folder, &model, true, progress)?;
         let named = found.outliers.iter().filter(|outlier| outlier.probability >= NAMED);
         // of magnets themselves their own rows tell
         let is_other = |number: &usize| !matches!(changed.unknowns[*number].kind, Kind::Strength(_));

@@ -26,18 +26,27 @@ pub struct Data {
 }
 
 impl Data {
-    /// Of a folder.
+    /// Of a folder, the elements that the reference fit counts.
     pub fn of(folder: &Folder) -> Self {
+        // without couplings LOCO takes the blocks x to V and y to H out of the data, and keeps both planes of the dispersion
+        Self::with_blocks(folder, uses(folder, |flags| &flags.coupling))
+    }
+
+    /// The same with the blocks of the other plane, which a reference fit without couplings leaves out, but for some elements: row and column.
+    pub fn with_coupling(folder: &Folder, outliers: &[[usize; 2]]) -> Self {
+        let mut data = Self::with_blocks(folder, true);
+        outliers.iter().for_each(|&[row, column]| data.sigma[(row, column)] = f64::INFINITY);
+        data
+    }
+
+    fn with_blocks(folder: &Folder, uses_coupling: bool) -> Self {
         let (rows, correctors) = folder.matrix.shape();
         let columns = correctors + usize::from(folder.dispersion.is_some());
         let value = |i: usize, j: usize| match &folder.dispersion {
             Some(dispersion) if j == correctors => dispersion[i],
             _ => folder.matrix[(i, j)],
         };
-        let uses =
-            |flag: fn(&Flags) -> &str| folder.meta.reference_fit.as_ref().is_none_or(|fit| flag(&fit.flags) == "Yes");
-        // without couplings LOCO takes the blocks x to V and y to H out of the data, and keeps both planes of the dispersion
-        let (uses_coupling, uses_dispersion) = (uses(|flags| &flags.coupling), uses(|flags| &flags.dispersion));
+        let uses_dispersion = uses(folder, |flags| &flags.dispersion);
         let counts = |i: usize, j: usize| {
             let monitor = &folder.monitors[i];
             let column = match folder.correctors.get(j) {
@@ -141,6 +150,11 @@ impl Data {
     pub fn elements(&self) -> usize {
         self.sigma.iter().filter(|sigma| sigma.is_finite()).count()
     }
+}
+
+/// True where the reference fit has a flag, and where there is no reference fit.
+fn uses(folder: &Folder, flag: fn(&Flags) -> &str) -> bool {
+    folder.meta.reference_fit.as_ref().is_none_or(|fit| flag(&fit.flags) == "Yes")
 }
 
 /// Measured less predicted, where it counts.

@@ -8,7 +8,6 @@
 use nalgebra::{DMatrix, DVector};
 use twin::Rf;
 
-use crate::data::Data;
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
@@ -194,14 +193,14 @@ impl Diagnosis {
         let (fitted, settings) = &share.fitted(folder, fitted, settings, progress)?;
         let hierarchy = Hierarchy::of_fit(folder, fitted, settings, progress)?;
         let model = Model::of(folder, &hierarchy.groups, settings.rf)?;
-        let (mut hierarchy, found) = released(hierarchy, folder, (&fitted.data, &model), fitted.has_ended, progress)?;
+        let (mut hierarchy, found) = released(hierarchy, folder, &model, fitted.has_ended, progress)?;
         let is_new = |straight: &Outlier| !found.unknowns().contains(&straight.unknown);
         let straights: Vec<Outlier> = straights(&hierarchy).into_iter().filter(is_new).collect();
         progress("elements held out");
         let held_out = [as_loco(folder, fitted, settings)?, with_families(&hierarchy, fitted)?];
         // parts of the matrix that tell a value differently bear out no smaller error
         hierarchy.uncertainty.sigma.zip_apply(&held_out[1].jackknife, |sigma, scatter| *sigma = sigma.max(scatter));
-        let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, &fitted.data, cable));
+        let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, cable));
         let members =
             found.outliers.iter().chain(&straights).map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
         let mut findings: Vec<Finding> = cables.chain(Finding::of_share(&share)).chain(members).collect();
@@ -212,7 +211,7 @@ impl Diagnosis {
         Ok(Self {
             imperfections: imperfections(&hierarchy),
             limits: limits(folder, &hierarchy, &found),
-            unexplained: unexplained(folder, fitted, &hierarchy),
+            unexplained: unexplained(folder, &hierarchy),
             share,
             findings,
             held_out,
@@ -226,7 +225,7 @@ impl Diagnosis {
 pub fn released(
     mut hierarchy: Hierarchy,
     folder: &Folder,
-    (data, model): (&Data, &Model),
+    model: &Model,
     has_ended: bool,
     progress: &mut dyn FnMut(&str),
 ) -> Result<(Hierarchy, Search), MeasuredError> {
@@ -240,7 +239,7 @@ pub fn released(
             break;
         }
         found.outliers.extend(further.outliers);
-        hierarchy = hierarchy.with_released(folder, (data, model), &found.unknowns(), progress)?;
+        hierarchy = hierarchy.with_released(folder, model, &found.unknowns(), progress)?;
     }
     // what was found first may be explained by what was found after it
     loop {
@@ -250,7 +249,7 @@ pub fn released(
         if found.outliers.len() == count {
             return Ok((hierarchy, found));
         }
-        hierarchy = hierarchy.with_released(folder, (data, model), &found.unknowns(), progress)?;
+        hierarchy = hierarchy.with_released(folder, model, &found.unknowns(), progress)?;
     }
 }
 
@@ -309,10 +308,10 @@ impl Finding {
     }
 
     /// Of a cable, with half the sum of squares that it would leave.
-    fn of_cable(folder: &Folder, hierarchy: &Hierarchy, data: &Data, cable: &Wiring) -> Self {
+    fn of_cable(folder: &Folder, hierarchy: &Hierarchy, cable: &Wiring) -> Self {
         let (word, at) = cable.named(folder);
         let gain = cable.squares(folder, &hierarchy.prediction.matrix, |row, column| {
-            hierarchy.noise.blocks[data.block[(row, column)]].spread(folder.monitors[row].sigma)
+            hierarchy.noise.blocks[hierarchy.data.block[(row, column)]].spread(folder.monitors[row].sigma)
         }) / 2.0;
         let (what, s, probability) = (What::Cable(cable.clone()), None, certain(gain));
         Self { what, word, at, s, amplitude: 1.0, sigma: 0.0, gain, probability, alternatives: Vec::new() }
@@ -400,7 +399,7 @@ fn as_loco(folder: &Folder, fitted: &Fit, settings: &Settings) -> Result<HeldOut
         noise: &fitted.noise,
         width: &width,
     };
-    HeldOut::of_fit(&fitted.data, &fit)
+    HeldOut::of_fit(&fitted.data, &fitted.data, &fit)
 }
 
 /// The fit with families and findings on elements held out.
@@ -419,12 +418,12 @@ fn with_families(hierarchy: &Hierarchy, fitted: &Fit) -> Result<HeldOut, Measure
         noise: &hierarchy.noise,
         width: &width,
     };
-    HeldOut::of_fit(&fitted.data, &fit)
+    HeldOut::of_fit(&hierarchy.data, &fitted.data, &fit)
 }
 
 /// Monitors' rows and correctors' columns whose residuals are larger than those of the others.
-fn unexplained(folder: &Folder, fitted: &Fit, hierarchy: &Hierarchy) -> Vec<Unexplained> {
-    let (data, residual) = (&fitted.data, &hierarchy.residual);
+fn unexplained(folder: &Folder, hierarchy: &Hierarchy) -> Vec<Unexplained> {
+    let Hierarchy { data, residual, .. } = hierarchy;
     let squares =
         residual.component_mul(residual).component_mul(&data.precision(&hierarchy.noise.with_equal_monitors()));
     let (sum, elements) = (squares.sum(), data.elements() as f64);

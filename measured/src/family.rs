@@ -351,7 +351,7 @@ mod tests {
 
     #[test]
     fn a_common_value_is_the_mean_and_no_scatter() {
-        let family = Family { weights: vec![1.0; 400], ..family("bpm_gain", 400, 0.1) };
+        let family = Family { weights: vec![1.0; 400], freedom: FREEDOM, ..family("bpm_gain", 400, 0.1) };
         let found = family.deviations(&DVector::from_element(400, 0.05), &DMatrix::zeros(400, 400));
         // the mean is drawn to what it was by (s/f)^2 of 400
         assert!((found.mean - 0.05).abs() < 0.05 / 400.0 && found.value.iter().all(|one| one.abs() < 2e-4));

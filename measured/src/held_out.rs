@@ -53,11 +53,11 @@ pub struct Fitted<'f> {
 }
 
 impl HeldOut {
-    /// Of all elements.
+    /// Of the elements that count in some data, by a fit of all elements of its own data.
     ///
     /// # Errors
     /// [`MeasuredError::Singular`].
-    pub fn of_fit(data: &Data, fit: &Fitted) -> Result<Self, MeasuredError> {
+    pub fn of_fit(data: &Data, counted: &Data, fit: &Fitted) -> Result<Self, MeasuredError> {
         let Fitted { places, prediction, precision, pull, noise, width } = fit;
         let residual = data.residual(prediction);
         let weight = data.weight(noise, &residual);
@@ -83,11 +83,12 @@ impl HeldOut {
                     .for_each(|&row| left[(row, column)] -= moved[(row, column)]);
             }
         }
+        left.zip_apply(&counted.sigma, |left, sigma| *left *= f64::from(sigma.is_finite()));
         let density = |column: usize| {
-            let counted = (0..rows).filter(|&row| data.sigma[(row, column)].is_finite());
-            counted.map(|row| data.log_density(noise, (row, column), left[(row, column)])).sum()
+            let rows = (0..rows).filter(|&row| counted.sigma[(row, column)].is_finite());
+            rows.map(|row| data.log_density(noise, (row, column), left[(row, column)])).sum()
         };
-        let elements = data.elements() as f64;
+        let elements = counted.elements() as f64;
         Ok(Self {
             log_density: (0..columns).map(density).collect(),
             rms: (left.norm_squared() / elements).sqrt(),
@@ -134,7 +135,7 @@ mod tests {
             noise: &fitted.noise,
             width: &DVector::from_iterator(n, fitted.unknowns.iter().map(|one| one.width)),
         };
-        let found = HeldOut::of_fit(&fitted.data, &fit).unwrap();
+        let found = HeldOut::of_fit(&fitted.data, &fitted.data, &fit).unwrap();
         let weight = fitted.data.weight(&fitted.noise, &fitted.residual);
         let mut squares = 0.0;
         for part in 0..PARTS * PARTS {

@@ -39,6 +39,8 @@ const STUCK: f64 = 1e6;
 /// A measurement with all its families.
 #[derive(Debug, Clone)]
 pub struct Hierarchy {
+    /// What is explained.
+    pub data: Data,
     /// Groups of magnets, those of the fit first.
     pub groups: Groups,
     /// All unknowns.
@@ -174,8 +176,13 @@ impl Hierarchy {
         }
         let model = Model::of(folder, &groups, settings.rf)?;
         let classes = unknowns.iter().map(|unknown| class(folder, &groups, unknown.kind)).collect();
-        let start = Start { groups, unknowns, values, classes, families, noise: fitted.noise.clone() };
-        start.settle(&model, &fitted.data, ROUNDS, progress)
+        let data = Data::with_coupling(folder, &fitted.outliers);
+        let prediction = model.predict(&unknowns, &values)?;
+        let (places, exact) = (Places::of(&unknowns, data.measured.nrows(), data.measured.ncols()), values.len());
+        let residual = (&data.residual(&prediction), &DMatrix::zeros(exact, exact));
+        let noise = fitted.noise.learnt(&data, &places, &prediction, residual);
+        let start = Start { data, groups, unknowns, values, classes, families, noise };
+        start.settle(&model, ROUNDS, progress)
     }
 
     /// The same with some members released, linearised anew.
@@ -185,7 +192,7 @@ impl Hierarchy {
     pub fn with_released(
         self,
         folder: &Folder,
-        (data, model): (&Data, &Model),
+        model: &Model,
         released: &[usize],
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
@@ -196,9 +203,9 @@ impl Hierarchy {
             let Some(known) = known else { continue };
             (family.mean, family.scale, family.freedom) = (known.mean, known.scale, known.freedom);
         }
-        let Self { groups, unknowns, values, classes, noise, .. } = self;
-        let start = Start { groups, unknowns, values, classes, families, noise };
-        start.settle(model, data, ROUNDS / 2, progress)
+        let Self { data, groups, unknowns, values, classes, noise, .. } = self;
+        let start = Start { data, groups, unknowns, values, classes, families, noise };
+        start.settle(model, ROUNDS / 2, progress)
     }
 
     /// Of another measurement of the same ring: changes about the values of this one, which are small beforehand.
@@ -208,7 +215,7 @@ impl Hierarchy {
     pub fn of_changes(
         &self,
         folder: &Folder,
-        (data, model): (&Data, &Model),
+        (data, model): (Data, &Model),
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
         let about = self.unknowns.iter().zip(&self.values);
@@ -218,8 +225,8 @@ impl Hierarchy {
         let wigglers = families.iter_mut().filter(|family| family.kind == Kind::Wiggler(0).word());
         wigglers.for_each(|family| family.freedom = 0.0);
         let Self { groups, values, classes, noise, .. } = self.clone();
-        let start = Start { groups, unknowns, values, classes, families, noise };
-        start.settle(model, data, ROUNDS, progress)
+        let start = Start { data, groups, unknowns, values, classes, families, noise };
+        start.settle(model, ROUNDS, progress)
     }
 
     /// Precision of the prior in widths.
@@ -295,6 +302,7 @@ impl Hierarchy {
 
 /// Where the fit with families begins.
 struct Start {
+    data: Data,
     groups: Groups,
     unknowns: Vec<Unknown>,
     values: DVector<f64>,
@@ -318,7 +326,6 @@ struct Linearised {
 /// What stays while a fit settles.
 struct Scene<'s> {
     model: &'s Model,
-    data: &'s Data,
     places: Places,
     width: DVector<f64>,
     mean: DVector<f64>,
@@ -329,14 +336,13 @@ impl Start {
     fn settle(
         mut self,
         model: &Model,
-        data: &Data,
         rounds: usize,
         progress: &mut dyn FnMut(&str),
     ) -> Result<Hierarchy, MeasuredError> {
-        let (rows, columns) = data.measured.shape();
+        let (rows, columns) = self.data.measured.shape();
         let each = |of: fn(&Unknown) -> f64| DVector::from_iterator(self.unknowns.len(), self.unknowns.iter().map(of));
         let places = Places::of(&self.unknowns, rows, columns);
-        let scene = Scene { model, data, places, width: each(|one| one.width), mean: each(|one| one.mean) };
+        let scene = Scene { model, places, width: each(|one| one.width), mean: each(|one| one.mean) };
         let mut prediction = model.predict(&self.unknowns, &self.values)?;
         let mut damping = DAMPING;
         for round in 1..=rounds {
@@ -349,8 +355,8 @@ impl Start {
             for family in &mut self.families {
                 family.mean += family.deviations(&posterior.values, &posterior.covariance).mean;
             }
-            let (left, covariance) = (data.residual(&prediction), times(posterior.covariance, &scene.width));
-            self.noise = self.noise.learnt(data, &scene.places, &prediction, (&left, &covariance));
+            let (left, covariance) = (self.data.residual(&prediction), times(posterior.covariance, &scene.width));
+            self.noise = self.noise.learnt(&self.data, &scene.places, &prediction, (&left, &covariance));
             if gained + promised < SETTLED {
                 break;
             }
@@ -360,10 +366,11 @@ impl Start {
         let covariance = times(posterior.covariance.clone(), &scene.width);
         let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
         let uncertainty =
-            Uncertainty::about((&scene.places, &prediction), (covariance, information), (data, &self.noise));
-        let Self { groups, unknowns, values, classes, families, noise } = self;
+            Uncertainty::about((&scene.places, &prediction), (covariance, information), (&self.data, &self.noise));
+        let Self { data, groups, unknowns, values, classes, families, noise } = self;
         let residual = here.residual;
         Ok(Hierarchy {
+            data,
             groups,
             unknowns,
             values,
@@ -379,8 +386,8 @@ impl Start {
 
     fn linearise(&self, scene: &Scene, prediction: &Prediction) -> Linearised {
         let n = self.unknowns.len();
-        let residual = scene.data.residual(prediction);
-        let weight = scene.data.weight(&self.noise, &residual);
+        let residual = self.data.residual(prediction);
+        let weight = self.data.weight(&self.noise, &residual);
         let normal = Normal::of(&scene.places, prediction, &residual, &weight, n);
         let expected = &scene.mean + means(&self.families, n).component_mul(&scene.width);
         Linearised {
@@ -403,7 +410,7 @@ impl Start {
     ) -> Result<(Prediction, f64), MeasuredError> {
         let prior = precision(&self.families, self.unknowns.len());
         let distance = |values: &DVector<f64>, prediction: &Prediction| {
-            let left = scene.data.residual(prediction);
+            let left = self.data.residual(prediction);
             let off = (values - &here.expected).component_div(&scene.width);
             left.component_mul(&left).dot(&here.weight) + off.dot(&(&prior * &off))
         };
