@@ -99,3 +99,66 @@ impl<'f> FittedRing<'f> {
         self.model.at(&self.fit.unknowns, &all)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::fit;
+    use crate::testing::{NOISE, machine, measured, ring};
+    use twin::{Hold, Optics};
+
+    /// Mean square error over the variance of both tunes, and of beta at all places, of six imperfect rings.
+    #[test]
+    fn optics_are_found_within_their_error_bars() {
+        let (folder, settings) = (ring(), Settings::default());
+        let (mut of_tunes, mut of_beta, mut betas) = (0.0, 0.0, 0.0);
+        for seed in 0..6 {
+            let truth = machine(&folder, seed);
+            let known = truth.0.at(&truth.1, &truth.2);
+            let known = Optics::of(&known, Hold::Momentum { delta: 0.0 }).unwrap();
+            let (tunes, twiss) = (known.tunes().unwrap(), known.twiss().unwrap());
+            let fit = fit(&measured(&folder, &truth, NOISE, 100 + seed), &settings, &mut |_| ()).unwrap();
+            let fitted = FittedRing::of(&folder, &fit, &settings).unwrap();
+            let found = fitted.optics().unwrap();
+            let [best, sigma] = found.tunes;
+            of_tunes += (((best.x - tunes.x) / sigma.x).powi(2) + ((best.y - tunes.y) / sigma.y).powi(2)) / 12.0;
+            let places = fitted.places(&folder);
+            assert_eq!(places.len(), 36); // 12 monitors, 24 quadrupoles
+            for (plane, &(_, at)) in [0, 1].into_iter().flat_map(|plane| places.iter().map(move |place| (plane, place)))
+            {
+                let off = found.twiss[at].beta[plane] - twiss[at].beta[plane];
+                of_beta += (off / found.sigma[at].beta[plane]).powi(2);
+                betas += 1.0;
+            }
+        }
+        // twelve squares scatter by 0.41; beta of one ring beats in two phases of each plane, so that 24 of all count
+        assert!((0.1..2.3).contains(&of_tunes), "{of_tunes}");
+        assert!((0.3..1.9).contains(&(of_beta / betas)), "{}", of_beta / betas);
+    }
+
+    /// Of each strength of a fit with skew gradients, against the derivative of the coupled modes.
+    #[test]
+    fn slopes_of_the_tunes_are_the_exact_ones() {
+        let (folder, settings) = (ring(), Settings::default());
+        let fit = fit(&measured(&folder, &machine(&folder, 3), NOISE, 4), &settings, &mut |_| ()).unwrap();
+        let fitted = FittedRing::of(&folder, &fit, &settings).unwrap();
+        let tunes = |values: &[f64]| {
+            let ring = fitted.ring(values);
+            let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 })?.tunes()?;
+            Ok::<_, OrbitError>(DVector::from_vec(vec![tunes.x, tunes.y]))
+        };
+        let (_, slopes) = differentiate(&fitted.values(), tunes).unwrap();
+        let best = fitted.best();
+        let optics = Optics::of(&best, Hold::Momentum { delta: 0.0 }).unwrap();
+        for (column, &at) in fitted.magnets.iter().enumerate() {
+            let Kind::Strength(group) = fit.unknowns[at].kind else { continue };
+            let element = best.element(&folder.element(fit.groups[0][group][0])).unwrap();
+            let per_unit = best.elements[element].kind.gradient().unwrap() / fit.values[at];
+            let exact = optics.tune_slope(&optics.gradient(element)).map(|slope| slope * per_unit);
+            for plane in 0..2 {
+                let error = (slopes[(plane, column)] / exact[plane] - 1.0).abs();
+                assert!(error < 1e-6, "{error}");
+            }
+        }
+    }
+}
