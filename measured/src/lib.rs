@@ -50,7 +50,7 @@ pub use fit::{Fit, Settings, fit};
 pub use folder::Folder;
 pub use likeness::Likeness;
 pub use model::{Model, Prediction};
-pub use optics::{FittedOptics, FittedRing};
+pub use optics::{Fitted, FittedOptics, FittedRing};
 pub use raw::RawOrbits;
 pub use straight::Straightened;
 pub use unknowns::{Kind, Unknown};

@@ -9,16 +9,38 @@ use twin::{CalibratedOptics, Kind as Field, OrbitError, Ring, Tunes, Twiss, diff
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
+use crate::hierarchy::Hierarchy;
 use crate::lattice::parts;
 use crate::model::Model;
-use crate::uncertainty::Marginal;
-use crate::unknowns::Kind;
+use crate::uncertainty::{Marginal, Uncertainty};
+use crate::unknowns::{Groups, Kind, Unknown};
 
-/// The ring of a fit as a function of its magnets.
+/// What was fitted: groups of magnets, unknowns, values, and how well they are known.
+#[derive(Debug, Clone, Copy)]
+pub struct Fitted<'f> {
+    groups: &'f Groups,
+    unknowns: &'f [Unknown],
+    values: &'f DVector<f64>,
+    uncertainty: &'f Uncertainty,
+}
+
+impl<'f> From<&'f Fit> for Fitted<'f> {
+    fn from(Fit { groups, unknowns, values, uncertainty, .. }: &'f Fit) -> Self {
+        Self { groups, unknowns, values, uncertainty }
+    }
+}
+
+impl<'f> From<&'f Hierarchy> for Fitted<'f> {
+    fn from(Hierarchy { groups, unknowns, values, uncertainty, .. }: &'f Hierarchy) -> Self {
+        Self { groups, unknowns, values, uncertainty }
+    }
+}
+
+/// The ring of a fit, as LOCO has it or with what an ordinary ring has besides, as a function of its magnets.
 #[derive(Debug, Clone)]
 pub struct FittedRing<'f> {
     model: Model,
-    fit: &'f Fit,
+    fit: Fitted<'f>,
     /// Unknowns that are magnets.
     magnets: Vec<usize>,
     uncertainty: Marginal,
@@ -40,13 +62,14 @@ impl<'f> FittedRing<'f> {
     ///
     /// # Errors
     /// [`MeasuredError::Lattice`].
-    pub fn of(folder: &Folder, fit: &'f Fit, settings: &Settings) -> Result<Self, MeasuredError> {
+    pub fn of(folder: &Folder, fit: impl Into<Fitted<'f>>, settings: &Settings) -> Result<Self, MeasuredError> {
+        let fit = fit.into();
         let is_magnet = |kind: Kind| {
             matches!(kind, Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_))
         };
         let magnets: Vec<usize> = (0..fit.unknowns.len()).filter(|&at| is_magnet(fit.unknowns[at].kind)).collect();
         let uncertainty = fit.uncertainty.among(&magnets);
-        Ok(Self { model: Model::of(folder, &fit.groups, settings.rf)?, fit, magnets, uncertainty })
+        Ok(Self { model: Model::of(folder, fit.groups, settings.rf)?, fit, magnets, uncertainty })
     }
 
     /// Its optics.
@@ -96,7 +119,7 @@ impl<'f> FittedRing<'f> {
     fn ring(&self, values: &[f64]) -> Ring {
         let mut all = self.fit.values.clone();
         self.magnets.iter().zip(values).for_each(|(&at, &value)| all[at] = value);
-        self.model.at(&self.fit.unknowns, &all)
+        self.model.at(self.fit.unknowns, &all)
     }
 }
 

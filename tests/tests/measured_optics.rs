@@ -3,7 +3,7 @@
 //! The run sets a magnet half a step below and above its gradient. The fitted ring is asked for the same: its tunes at both gradients, coupled as it
 //! is and along the whole magnet. The magnets follow less than they are set to, by a share that all of one day have in common.
 
-use measured::{FittedRing, Folder, Settings, Straightened};
+use measured::{Diagnosis, FittedRing, Folder, Settings, Straightened};
 use nalgebra::DVector;
 use serde_json::Value;
 use system_tests::measured_ring;
@@ -117,11 +117,11 @@ fn compared(steps: &[Step], found: &DVector<f64>, sigma: &DVector<f64>) -> (f64,
     (scale, squares / counted.len() as f64)
 }
 
-/// The matrix of 22 June was measured before its run, and its lattice has insertion devices as drifts: what they focus vertically, the fit has to
-/// give to quadrupoles, and its vertical tune is 0.006 off.
+/// The lattice has insertion devices as drifts. What those that were closed on 22 June focus vertically, a fit as LOCO's gives to quadrupoles, and its
+/// vertical tune is 0.006 off; the fit of a diagnosis has straights that focus.
 #[test]
 fn fitted_beta_is_that_of_changed_quadrupoles() {
-    println!("day, scale, mean square pull, as written, tunes less measured ones");
+    println!("day, program, scale, mean square pull, of the lattice as written, tunes less measured ones, their sigma");
     let mut used = Vec::new();
     for (day, folder) in [
         ("2012-08-25_07-10-40", "families_3/before"),
@@ -135,22 +135,35 @@ fn fitted_beta_is_that_of_changed_quadrupoles() {
             continue;
         }
         let settings = Settings::default();
-        let Straightened { folder, fit, .. } =
-            Straightened::of(&Folder::read(&path).unwrap(), &settings, &mut |_| ()).unwrap();
-        let fitted = FittedRing::of(&folder, &fit, &settings).unwrap();
-        let [found, sigma] = fitted.functions(|ring| run(ring, &steps)).unwrap();
-        let (scale, pull) = compared(&steps, &found, &sigma);
-        let written = run(&measured::lattice::ring(&folder, &[], &[]).unwrap(), &steps).unwrap();
+        let straightened = Straightened::of(&Folder::read(&path).unwrap(), &settings, &mut |_| ()).unwrap();
+        let Straightened { folder, cables, fit } = &straightened;
+        let diagnosis = Diagnosis::of_fit((folder, cables), fit, &settings, &mut |_| ()).unwrap();
+        let written = run(&measured::lattice::ring(folder, &[], &[]).unwrap(), &steps).unwrap();
         let (_, pull_written) = compared(&steps, &written, &DVector::zeros(written.len()));
         let first = [0, 1].map(|plane| median(steps[1..4].iter().map(|one| one.mean(plane)).collect()));
-        let off = [0, 1].map(|plane| found[2 * steps.len() + plane].fract() - first[plane]);
-        println!("{day}, {scale:.3}, {pull:.2}, {pull_written:.2}, {:+.4} {:+.4}", off[0], off[1]);
-        assert!(pull < 1.5 && pull < pull_written, "{day}: {pull}, as written {pull_written}");
-        // steps of iron that was not cycled are some 10 % smaller than set
-        assert!((0.8..1.0).contains(&scale), "{day}: {scale}");
-        assert!(off[0].abs() < 0.002, "{day}: {off:?}");
-        used.push((day, off[1]));
+        for (name, fitted) in [
+            ("fit", FittedRing::of(folder, fit, &settings).unwrap()),
+            ("diagnose", FittedRing::of(folder, &diagnosis.hierarchy, &settings).unwrap()),
+        ] {
+            let [found, sigma] = fitted.functions(|ring| run(ring, &steps)).unwrap();
+            let (scale, pull) = compared(&steps, &found, &sigma);
+            let [off, error] = [0, 1].map(|which| {
+                [0, 1].map(|plane| {
+                    let at = 2 * steps.len() + plane;
+                    if which == 0 { found[at].fract() - first[plane] } else { sigma[at] }
+                })
+            });
+            println!("{day}, {name}, {scale:.3}, {pull:.2}, {pull_written:.2}, {off:+.4?}, {error:.4?}");
+            assert!(pull < 1.5 && pull < pull_written, "{day}: {pull}, as written {pull_written}");
+            // steps of iron that is not cycled are some 10 % smaller than set
+            assert!((0.8..1.0).contains(&scale), "{day}: {scale}");
+            assert!(off[0].abs() < 0.002, "{day}: {off:?}");
+            // the fit has no insertion devices, which were closed in 2013
+            let is_complete = name == "diagnose" || day.starts_with("2012");
+            // one reading is good to 0.0007, and both days are 0.0014 to 0.0020 below it
+            assert!(!is_complete || off[1].abs() < 0.0025, "{day}: {off:?}");
+        }
+        used.push(day);
     }
     assert_eq!(used.len(), 2, "{used:?}");
-    assert!(used[0].1.abs() < 0.002, "{used:?}");
 }
