@@ -80,11 +80,41 @@ impl Uncertainty {
         if of_data > 0.0 { ((self.sigma[unknown].powi(2) - of_prior) / of_data).max(1.0) } else { 1.0 }
     }
 
+    /// Among some of the unknowns.
+    pub fn among(&self, unknowns: &[usize]) -> Marginal {
+        let directions = self.independent.select_columns(unknowns);
+        let of_lines = self.together.tr_mul(&directions);
+        Marginal {
+            lines: of_lines.tr_mul(&of_lines),
+            elements: directions.tr_mul(&(&self.alone * &directions)),
+            of_data: directions.tr_mul(&(&self.information * &directions)),
+            independent: directions.select_rows(unknowns),
+        }
+    }
+
     /// Variance of a combination of the unknowns.
     pub fn variance(&self, combination: &DVector<f64>) -> f64 {
         let direction = &self.independent * combination;
         let [elements, data] = [&self.alone, &self.information].map(|matrix| direction.dot(&(matrix * &direction)));
         variance(self.together.tr_mul(&direction).norm_squared(), elements, data, combination.dot(&direction))
+    }
+}
+
+/// The same among some of the unknowns, where many combinations of a few are asked for.
+#[derive(Debug, Clone)]
+pub struct Marginal {
+    lines: DMatrix<f64>,
+    elements: DMatrix<f64>,
+    of_data: DMatrix<f64>,
+    independent: DMatrix<f64>,
+}
+
+impl Marginal {
+    /// Variances of combinations, rows `[M][N]` of the chosen unknowns.
+    pub fn variances(&self, combinations: &DMatrix<f64>) -> DVector<f64> {
+        let [lines, elements, of_data, independent] = [&self.lines, &self.elements, &self.of_data, &self.independent]
+            .map(|form| (combinations * form).component_mul(combinations).column_sum());
+        DVector::from_fn(combinations.nrows(), |i, _| variance(lines[i], elements[i], of_data[i], independent[i]))
     }
 }
 
@@ -113,6 +143,8 @@ fn together(places: &Places, at: &Prediction, slope: &DMatrix<f64>, unknowns: us
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::{DMatrix, DVector};
+
     use crate::fit::{Settings, fit};
     use crate::testing::{NOISE, machine, measured, normal, ring};
 
@@ -139,6 +171,21 @@ mod tests {
             }
         }
         sums
+    }
+
+    #[test]
+    fn combinations_of_a_few_have_the_variance_of_combinations_of_all() {
+        let ring = ring();
+        let fit = fit(&measured(&ring, &machine(&ring, 5), NOISE, 6), &Settings::default(), &mut |_| ()).unwrap();
+        let some = [3, 0, 11];
+        let combinations = DMatrix::from_row_slice(2, 3, &[0.5, -2.0, 1.0, 1.0, 1.0, 0.0]);
+        let variances = fit.uncertainty.among(&some).variances(&combinations);
+        for (row, variance) in combinations.row_iter().zip(&variances) {
+            let mut whole = DVector::zeros(fit.unknowns.len());
+            some.iter().zip(row.iter()).for_each(|(&at, &share)| whole[at] = share);
+            let known = fit.uncertainty.variance(&whole);
+            assert!((variance / known - 1.0).abs() < 1e-9, "{variance} {known}");
+        }
     }
 
     #[test]

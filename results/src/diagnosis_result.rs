@@ -341,7 +341,7 @@ fn tunes_of(diagnosis: &Diagnosis) -> Option<Tunes> {
     let tunes = machine.on_orbit(&drives.orbit).optics().and_then(|optics| optics.tunes()).ok()?;
     let [x, y] = best.tunes_of_element(data).ok()?;
     let [of_x, of_y] = best.data(data).tune_shift_of_orbit;
-    Some(Tunes { x: tunes.x + x + of_x, y: tunes.y + y + of_y })
+    Some(Tunes { x: tunes.x + x + of_x, y: tunes.y + y + of_y, sigma: None })
 }
 
 fn vars(ring: &Ring, vars: &Vars) -> Vec<Var> {

@@ -46,7 +46,8 @@ pub fn fit_by_steps(
 ) -> Result<FitResult, CommandError> {
     let (campaign, fit) = fitted(ring, recording, progress)?;
     let notes = vec![format!("{} Gauss-Newton steps", fit.steps)];
-    Ok(FitResult { notes, ..FitResult::of_fit(&campaign, &fit) })
+    let result = FitResult::of_fit(&campaign, &fit).with_optics(&campaign.ring, &campaign.supplies);
+    Ok(FitResult { notes, ..result })
 }
 
 /// The campaign and its batch fit, measured tunes as readings.
@@ -95,6 +96,7 @@ pub fn fit_by_draws(
         _ => failed(error.to_string()),
     })?;
     let result = FitResult::of_draws(&reduced, word, &run);
+    let result = result.with_optics(&reduced.campaign.ring, &reduced.campaign.supplies);
     let extrapolated = is_network.then(|| outside(&posterior, &run));
     Ok((FitResult { notes: notes(&run), extrapolated, ..result }, run.draws))
 }

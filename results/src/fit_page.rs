@@ -1,11 +1,9 @@
 //! The report of a fit: the optics of the calibrated ring beside the design's, with error bars.
 //!
-//! The exact optics are taken at the means of the strengths; their error bars are the covariance of the strengths carried
-//! through the derivatives of those optics, `sigma^2 = J C J^T`.
+//! The exact optics are taken at the means of the strengths.
 
 use core::f64::consts::TAU;
 
-use nalgebra::DMatrix;
 use report::{Axes, Band, Figure, Page, Reference, Section, Series, Table};
 use twin::{CalibratedOptics, Hold, Optics, OrbitError, Ring, Tunes, Twiss};
 
@@ -47,12 +45,7 @@ pub fn page(ring: &Ring, supplies: &[f64], result: &FitResult) -> Result<Page, O
 
 impl<'r> Calibrated<'r> {
     fn of(ring: &'r Ring, supplies: &[f64], result: &'r FitResult) -> Result<Self, OrbitError> {
-        let means: Vec<f64> = result.vars.iter().map(|var| var.mean).collect();
-        let params: Vec<f64> = means.iter().map(|mean| mean.ln()).collect();
-        let optics = CalibratedOptics::of(ring, &params, supplies)?;
-        // result.covariance is that of the factors
-        let of_params = |i: usize, j: usize| result.covariance[i][j] / (means[i] * means[j]);
-        let sigma = optics.sigma(&DMatrix::from_fn(means.len(), means.len(), of_params));
+        let (optics, sigma) = result.calibrated_optics(ring, supplies)?;
         let design = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let design = (design.twiss()?, design.tunes()?);
         let s = ring.elements.iter().map(|element| element.s).chain([ring.circumference]).collect();

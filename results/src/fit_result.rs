@@ -11,9 +11,10 @@ use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
+use nalgebra::DMatrix;
 use serde::Serialize;
 use studies::Sampled;
-use twin::Ring;
+use twin::{CalibratedOptics, OrbitError, Ring, Twiss};
 
 pub use monitor::{Monitor, faults, monitors, state_word};
 pub use tunes::{TuneMeasured, Tunes, TunesMeasured};
@@ -21,6 +22,7 @@ use tunes::{measured, tunes};
 use var::covariance;
 pub use var::{Var, vars_of};
 
+use crate::optics::{OpticsAt, optics_at, places};
 use crate::output::{fill, table};
 use crate::record::{EstimateRecord, Remarked};
 
@@ -47,6 +49,9 @@ pub struct FitResult {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tunes: Option<Tunes>,
     pub tunes_measured: TunesMeasured,
+    /// At monitors and quadrupoles, of a fit whose ring is stable.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub optics: Vec<OpticsAt>,
     /// What the recording lacks to say anything: the vars are then those of the prior, but for measured tunes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lack: Option<String>,
@@ -155,6 +160,7 @@ impl FitResult {
                 .then(|| f64::from(quality.chi_square / quality.degrees_of_freedom)),
             mismatch: quality.is_mismatch(),
             monitors: last.monitors(),
+            optics: Vec::new(),
             log_evidence: Some(f64::from(last.log_evidence)),
             timing: Some(timing),
             nuts: None,
@@ -207,8 +213,9 @@ impl FitResult {
             covariance: Vec::new(),
             chi2_per_dof: Some(fit.chi2_per_dof).filter(|chi2| chi2.is_finite()),
             mismatch: fit.mismatch,
-            tunes: Some(Tunes { x: x.model, y: y.model }),
+            tunes: Some(Tunes { x: x.model, y: y.model, sigma: None }),
             tunes_measured: TunesMeasured { x: measured(x), y: measured(y) },
+            optics: Vec::new(),
             lack: fit.lack.map(|lack| lack.to_string()),
             monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
             log_evidence: None,
@@ -217,6 +224,32 @@ impl FitResult {
             extrapolated: None,
             notes: Vec::new(),
         }
+    }
+
+    /// With the optics that follow from the vars, at `ln` of the supplies' factors [F]; as it is where that ring is unstable.
+    pub(crate) fn with_optics(self, ring: &Ring, supplies: &[f64]) -> Self {
+        let Ok((optics, (sigma, of_tunes))) = self.calibrated_optics(ring, supplies) else { return self };
+        let optics_of_places = optics_at(ring, &places(ring), &optics.twiss, &sigma);
+        Self { tunes: Some(Tunes::with_sigma([optics.tunes, of_tunes])), optics: optics_of_places, ..self }
+    }
+
+    /// The optics that follow from the vars and their standard deviations: the covariance of the vars carried through the derivatives,
+    /// `sigma^2 = J C J^T`.
+    ///
+    /// # Errors
+    /// [`OrbitError`] of unstable motion.
+    pub(crate) fn calibrated_optics(
+        &self,
+        ring: &Ring,
+        supplies: &[f64],
+    ) -> Result<(CalibratedOptics, (Vec<Twiss>, twin::Tunes)), OrbitError> {
+        let means: Vec<f64> = self.vars.iter().map(|var| var.mean).collect();
+        let params: Vec<f64> = means.iter().map(|mean| mean.ln()).collect();
+        let optics = CalibratedOptics::of(ring, &params, supplies)?;
+        // self.covariance is that of the factors
+        let of_params = |i: usize, j: usize| self.covariance[i][j] / (means[i] * means[j]);
+        let sigma = optics.sigma(&DMatrix::from_fn(means.len(), means.len(), of_params));
+        Ok((optics, sigma))
     }
 
     /// One var a row, or two where their names are short enough for 80 columns.
@@ -265,7 +298,7 @@ impl fmt::Display for FitResult {
         self.remarks().iter().try_for_each(|remark| writeln!(f, "{}", fill(remark)))?;
         write!(f, "chi2/dof {}", self.chi2())?;
         if let Some(tunes) = &self.tunes {
-            write!(f, ", tunes {:.4} {:.4}, {}", tunes.x, tunes.y, self.tunes_measured)?;
+            write!(f, ", tunes {tunes}, {}", self.tunes_measured)?;
         }
         if self.rejected_frames > 0 {
             write!(f, ", {} frames refused", self.rejected_frames)?;

@@ -1,14 +1,15 @@
 //! A measured response matrix fitted and diagnosed: the results of `orbitcal fit` and `orbitcal diagnose`, and their pages.
 
-use measured::{Believed, Diagnosis, Folder, Model, Settings, Straightened};
+use measured::{Believed, Diagnosis, FittedOptics, FittedRing, Folder, Model, Settings, Straightened};
 use nalgebra::DVector;
 use report::Page;
-use twin::{Hold, Optics};
 
 use crate::error::CommandError;
+use crate::fit_result::Tunes;
 use crate::matrix_diagnosis::MatrixDiagnosis;
 use crate::matrix_page::Measured;
 use crate::matrix_result::MatrixFit;
+use crate::optics::optics_at;
 
 /// A measured matrix with its cables put right, fitted.
 pub struct FittedMatrix {
@@ -84,11 +85,14 @@ fn measured_of<'r>(
 ) -> Result<Measured<'r>, CommandError> {
     let model = Model::of(folder, &fit.groups, settings.rf)?;
     let rings = [model.at(&[], &DVector::zeros(0)), model.at(&fit.unknowns, &fit.values)];
-    Ok(Measured { folder, fit, result, rings })
+    let optics = FittedRing::of(folder, fit, settings)?.optics()?;
+    Ok(Measured { folder, fit, result, rings, optics })
 }
 
 fn result(Straightened { folder, cables, fit }: &Straightened, settings: &Settings) -> Result<MatrixFit, CommandError> {
-    let ring = Model::of(folder, &fit.groups, settings.rf)?.at(&fit.unknowns, &fit.values);
-    let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok().and_then(|optics| optics.tunes().ok());
-    Ok(MatrixFit::of(folder, cables, fit, tunes.map(|tunes| [tunes.x, tunes.y])))
+    let ring = FittedRing::of(folder, fit, settings)?;
+    let optics = ring.optics().map(|FittedOptics { twiss, sigma, tunes }| {
+        (Some(Tunes::with_sigma(tunes)), optics_at(&ring.best(), &ring.places(folder), &twiss, &sigma))
+    });
+    Ok(MatrixFit::of(folder, cables, fit, optics.unwrap_or_default()))
 }

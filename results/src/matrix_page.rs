@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use measured::{Fit, Folder, Kind, unknowns};
+use measured::{Fit, FittedOptics, Folder, Kind, unknowns};
 use report::{Axes, Band, Figure, Look, Magnet, Map, Page, Reference, Section, Series, Spotted, Strip, Symbol, Table};
 use twin::{Hold, Optics, OrbitError, Plane, Ring, Twiss};
 
@@ -28,6 +28,8 @@ pub struct Measured<'r> {
     pub result: &'r MatrixFit,
     /// The ring of the lattice, and that of the fit.
     pub rings: [Ring; 2],
+    /// Optics of the fitted ring.
+    pub optics: FittedOptics,
 }
 
 impl Measured<'_> {
@@ -37,8 +39,7 @@ impl Measured<'_> {
     /// [`OrbitError`] where the lattice or the fitted ring has no stable motion.
     pub fn page(&self) -> Result<Page, OrbitError> {
         let result = self.result;
-        let tunes =
-            result.tunes.as_ref().map_or(String::new(), |tunes| format!(" Tunes {:.4} and {:.4}.", tunes.x, tunes.y));
+        let tunes = result.tunes.as_ref().map_or(String::new(), |tunes| format!(" Tunes {tunes}."));
         let lead = format!(
             "{} elements of the response matrix, {} set aside. Chi-square per element with the stated noise: {:.4} as the lattice has it, {:.4} \
              fitted.{tunes}",
@@ -138,9 +139,8 @@ impl Measured<'_> {
 
     /// Strengths, optics and dispersion of the fitted ring.
     fn ring(&self) -> Result<Vec<Section>, OrbitError> {
-        let [lattice, fitted] = [&self.rings[0], &self.rings[1]]
-            .map(|ring| Optics::of(ring, Hold::Momentum { delta: 0.0 }).and_then(|optics| optics.twiss()));
-        let (lattice, fitted) = (lattice?, fitted?);
+        let lattice = Optics::of(&self.rings[0], Hold::Momentum { delta: 0.0 })?.twiss()?;
+        let FittedOptics { twiss: fitted, sigma, .. } = &self.optics;
         let ring = &self.rings[1];
         let s: Vec<f64> = ring.elements.iter().map(|element| element.s).chain([ring.circumference]).collect();
         let along = |name: &str, of: &dyn Fn(&Twiss, &Twiss) -> f64| {
@@ -150,14 +150,21 @@ impl Measured<'_> {
                 fitted.iter().zip(&lattice).map(|(fitted, lattice)| of(fitted, lattice)).collect(),
             )
         };
+        let beats = |name: &str, plane: usize| {
+            let all = fitted.iter().zip(&lattice).zip(sigma);
+            let within = all.map(|((fitted, lattice), sigma)| {
+                let (beat, sigma) = (fitted.beta_beat(lattice)[plane], sigma.beta[plane] / lattice.beta[plane]);
+                (100.0 * (beat - sigma), 100.0 * (beat + sigma))
+            });
+            along(name, &|fitted, lattice| 100.0 * fitted.beta_beat(lattice)[plane]).within(within.collect())
+        };
         let axes = Axes::new("Beta-beat", "path length [m]", "beta/beta of the lattice - 1 [%]");
-        let beat = |plane: usize| move |fitted: &Twiss, lattice: &Twiss| 100.0 * fitted.beta_beat(lattice)[plane];
         let figure = Figure::lines(
             &axes.compared(Reference::Level(0.0)).along(self.strip(&[])),
-            &[along("x", &beat(0)), along("y", &beat(1))],
+            &[beats("x", 0), beats("y", 1)],
         );
         let mut optics = vec![(
-            "Relative change of the beta functions from the lattice as written to the fitted ring.".into(),
+            "Relative change of the beta functions from the lattice as written to the fitted ring. Bands are standard deviations.".into(),
             figure,
         )];
         let mut series = vec![

@@ -11,6 +11,7 @@ use measured::{Fit, Folder, Kind, Wiring};
 use serde::{Deserialize, Serialize};
 
 use crate::fit_result::{Monitor, Tunes};
+use crate::optics::OpticsAt;
 use crate::output::{fill, table};
 
 /// Strength factors and instruments of a measured matrix. Field names are those of the command's JSON.
@@ -33,6 +34,9 @@ pub struct MatrixFit {
     pub chi2_loco_start: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tunes: Option<Tunes>,
+    /// At monitors and quadrupoles, where the fitted ring is stable.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub optics: Vec<OpticsAt>,
     pub monitors: Vec<Monitor>,
     pub other: Vec<Other>,
     pub degenerate: Vec<Vec<String>>,
@@ -129,8 +133,8 @@ impl From<StatedModel> for Believed {
 }
 
 impl MatrixFit {
-    /// Of a fit.
-    pub fn of(folder: &Folder, cables: &[Wiring], fit: &Fit, tunes: Option<[f64; 2]>) -> Self {
+    /// Of a fit, with the optics of its ring where it is stable.
+    pub fn of(folder: &Folder, cables: &[Wiring], fit: &Fit, (tunes, optics): (Option<Tunes>, Vec<OpticsAt>)) -> Self {
         let rows = fitted_rows(fit);
         // correlations of independent errors
         let independent = &fit.uncertainty.independent;
@@ -152,7 +156,8 @@ impl MatrixFit {
             chi2_per_dof: chi2 / (fit.elements as f64 - fit.unknowns.len() as f64).max(1.0),
             chi2_loco: fit.chi2_loco,
             chi2_loco_start: fit.chi2_start,
-            tunes: tunes.map(|[x, y]| Tunes { x, y }),
+            tunes,
+            optics,
             monitors: monitors(folder, fit),
             other: others(folder, (&fit.groups, &fit.unknowns), value),
             degenerate: fit.degenerate().iter().map(|set| set.iter().map(|&at| called(at)).collect()).collect(),
@@ -286,7 +291,7 @@ impl fmt::Display for MatrixFit {
             writeln!(f, "{}", fill(&line))?;
         }
         if let Some(tunes) = &self.tunes {
-            writeln!(f, "tunes {:.4} {:.4}", tunes.x, tunes.y)?;
+            writeln!(f, "tunes {tunes}")?;
         }
         let doubtful =
             self.monitors.iter().filter(|one| one.state != "ok").map(|one| format!("{} {}", one.name, one.state));

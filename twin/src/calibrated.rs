@@ -1,4 +1,4 @@
-//! Optics functions of a fitted ring with the error bars of its params: beta, phase advance, dispersion and tunes.
+//! Optics functions of a fitted ring with the error bars of what was fitted: beta, phase advance, dispersion and tunes.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -8,22 +8,44 @@ use crate::response::Optics;
 use crate::tune::Tunes;
 use crate::twiss::Twiss;
 
-/// Optics functions at some params, and their derivative with respect to each.
+/// Optics functions at some values of what was fitted, and their derivative with respect to each.
 #[derive(Debug, Clone)]
 pub struct CalibratedOptics {
     /// At the entrance of every element, and once more at the end of the ring.
     pub twiss: Vec<Twiss>,
     /// Tunes with their integer part.
     pub tunes: Tunes,
-    /// Rows all numbers of `twiss`, then the tunes; columns params.
+    /// Rows all numbers of `twiss`, then the tunes; columns what was fitted.
     slopes: DMatrix<f64>,
 }
 
-/// Step of each param; truncation and rounding of the central difference stay below 1e-6 of a derivative.
+/// Step of each value; truncation and rounding of the central difference stay below 1e-6 of a derivative.
 const STEP: f64 = 1e-4;
 
 /// Numbers of one place.
 const EACH: usize = 6;
+
+/// Functions `[M]` of values `[N]`, and their derivatives `[M][N]` by central differences of a step of 1e-4: of optics by params, by strength
+/// factors and by skew gradients [1/m] to 1e-6.
+///
+/// # Errors
+/// Those of the functions.
+pub fn differentiate<E>(
+    values: &[f64],
+    functions: impl Fn(&[f64]) -> Result<DVector<f64>, E>,
+) -> Result<(DVector<f64>, DMatrix<f64>), E> {
+    let here = functions(values)?;
+    let mut slopes = DMatrix::zeros(here.len(), values.len());
+    for j in 0..values.len() {
+        let stepped = |step: f64| {
+            let mut values = values.to_vec();
+            values[j] += step;
+            functions(&values)
+        };
+        slopes.set_column(j, &((stepped(STEP)? - stepped(-STEP)?) / (2.0 * STEP)));
+    }
+    Ok((here, slopes))
+}
 
 impl CalibratedOptics {
     /// Of a ring at params and supplies, as in [`Ring::strengths`].
@@ -31,30 +53,27 @@ impl CalibratedOptics {
     /// # Errors
     /// [`OrbitError`] where there is no stable ring, there or a step of 1e-4 beside it.
     pub fn of(ring: &Ring, params: &[f64], supplies: &[f64]) -> Result<Self, OrbitError> {
-        let at = |params: &[f64]| functions(&ring.with_strengths(&ring.strengths(params, supplies)));
-        let (twiss, tunes) = at(params)?;
-        let column = |j: usize| {
-            let stepped = |step: f64| {
-                let mut params = params.to_vec();
-                params[j] += step;
-                at(&params).map(|functions| numbers(&functions))
-            };
-            Ok((stepped(STEP)? - stepped(-STEP)?) / (2.0 * STEP))
-        };
-        let mut slopes = DMatrix::zeros(EACH * twiss.len() + 2, params.len());
-        for j in 0..params.len() {
-            slopes.set_column(j, &column(j)?);
-        }
+        Self::at(params, |params| ring.with_strengths(&ring.strengths(params, supplies)))
+    }
+
+    /// Of the ring at some values [N].
+    ///
+    /// # Errors
+    /// As [`CalibratedOptics::of`].
+    pub fn at(values: &[f64], ring: impl Fn(&[f64]) -> Ring) -> Result<Self, OrbitError> {
+        let (functions, slopes) = differentiate(values, |values| functions(&ring(values)))?;
+        let (twiss, tunes) = from_numbers(&functions);
         Ok(Self { twiss, tunes, slopes })
     }
 
-    /// Standard deviations of all functions, from the covariance of the params `[N][N]`: `sigma^2 = J C J^T`.
+    /// Standard deviations of all functions, from the covariance of what was fitted `[N][N]`: `sigma^2 = J C J^T`.
     pub fn sigma(&self, covariance: &DMatrix<f64>) -> (Vec<Twiss>, Tunes) {
-        let variance = (&self.slopes * covariance).component_mul(&self.slopes).column_sum();
-        let sigma = variance.map(|variance| variance.max(0.0).sqrt());
-        let places = self.twiss.len();
-        let twiss = (0..places).map(|place| Twiss::from_numbers(&sigma.as_slice()[EACH * place..])).collect();
-        (twiss, Tunes { x: sigma[EACH * places], y: sigma[EACH * places + 1] })
+        self.sigma_by(|slopes| (slopes * covariance).component_mul(slopes).column_sum())
+    }
+
+    /// The same from the variances `[M]` of combinations of what was fitted, rows `[M][N]`.
+    pub fn sigma_by(&self, variances: impl Fn(&DMatrix<f64>) -> DVector<f64>) -> (Vec<Twiss>, Tunes) {
+        from_numbers(&variances(&self.slopes).map(|variance| variance.max(0.0).sqrt()))
     }
 }
 
@@ -75,14 +94,16 @@ impl Twiss {
     }
 }
 
-fn functions(ring: &Ring) -> Result<(Vec<Twiss>, Tunes), OrbitError> {
+fn functions(ring: &Ring) -> Result<DVector<f64>, OrbitError> {
     let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-    Ok((optics.twiss()?, optics.tunes()?))
+    let (twiss, tunes) = (optics.twiss()?, optics.tunes()?);
+    let numbers = twiss.iter().flat_map(Twiss::numbers).chain([tunes.x, tunes.y]);
+    Ok(DVector::from_iterator(EACH * twiss.len() + 2, numbers))
 }
 
-fn numbers((twiss, tunes): &(Vec<Twiss>, Tunes)) -> DVector<f64> {
-    let all = twiss.iter().flat_map(Twiss::numbers).chain([tunes.x, tunes.y]);
-    DVector::from_iterator(EACH * twiss.len() + 2, all)
+fn from_numbers(numbers: &DVector<f64>) -> (Vec<Twiss>, Tunes) {
+    let (places, tunes) = numbers.as_slice().split_at(numbers.len() - 2);
+    (places.chunks(EACH).map(Twiss::from_numbers).collect(), Tunes { x: tunes[0], y: tunes[1] })
 }
 
 #[cfg(test)]
@@ -128,11 +149,29 @@ mod tests {
         }
     }
 
+    /// Of each quadrupole alone against the exact derivative of the tunes.
+    #[test]
+    fn differences_are_derivatives() {
+        let ring = Ring::booster();
+        let calibrated = CalibratedOptics::of(&ring, &[0.0; 48], &[]).unwrap();
+        let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
+        for (parameter, quadrupole) in ring.quadrupoles.iter().enumerate() {
+            let mut covariance = DMatrix::zeros(48, 48);
+            covariance[(parameter, parameter)] = 1.0;
+            let (_, tunes) = calibrated.sigma(&covariance);
+            let exact = optics.tune_slope(&optics.gradient(quadrupole.element));
+            for (ours, exact) in [tunes.x, tunes.y].into_iter().zip(exact) {
+                let exact = (exact * ring.gradients()[parameter]).abs();
+                assert!((ours / exact - 1.0).abs() < 1e-6, "{ours} {exact}");
+            }
+        }
+    }
+
     #[test]
     fn the_phase_advances_by_the_tune() {
         let ring = Ring::booster();
         let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
-        let (twiss, tunes) = functions(&ring).unwrap();
+        let (twiss, tunes) = from_numbers(&functions(&ring).unwrap());
         let (first, last) = (twiss[0], twiss[ring.elements.len()]);
         assert!((last.phase_advance[0] - TAU * tunes.x).abs() < 1e-9, "{last:?}");
         assert!((last.phase_advance[1] - TAU * tunes.y).abs() < 1e-9, "{last:?}");
@@ -144,7 +183,7 @@ mod tests {
 
     #[test]
     fn a_ring_beats_against_itself_by_nothing() {
-        let (twiss, _) = functions(&Ring::booster()).unwrap();
+        let (twiss, _) = from_numbers(&functions(&Ring::booster()).unwrap());
         assert_eq!(twiss[3].beta_beat(&twiss[3]), [0.0; 2]);
         let more = Twiss { beta: twiss[3].beta.map(|beta| 1.1 * beta), ..twiss[3] };
         assert!(more.beta_beat(&twiss[3]).iter().all(|beat| (beat - 0.1).abs() < 1e-12));

@@ -30,7 +30,7 @@ mod tune;
 mod twiss;
 mod varied;
 
-pub use calibrated::CalibratedOptics;
+pub use calibrated::{CalibratedOptics, differentiate};
 pub use effects::{
     Class, CorrectorEffect, Cycle, DriftEffect, Drives, Effect, EffectError, EffectKind, EffectText, FieldEffect, Held,
     HoldEffect, Holding, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin,

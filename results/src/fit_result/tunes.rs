@@ -21,6 +21,39 @@ const SCATTERS: f64 = 30.0;
 pub struct Tunes {
     pub x: f64,
     pub y: f64,
+    /// Standard deviations, of a fit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sigma: Option<TunesSigma>,
+}
+
+/// Standard deviations of both tunes.
+#[derive(Debug, Clone, Copy, Serialize)]
+#[allow(missing_docs)] // named after what they are
+pub struct TunesSigma {
+    pub x: f64,
+    pub y: f64,
+}
+
+impl Tunes {
+    /// Tunes and their standard deviations.
+    pub fn with_sigma([tunes, sigma]: [twin::Tunes; 2]) -> Self {
+        Self { sigma: Some(TunesSigma { x: sigma.x, y: sigma.y }), ..Self::from(tunes) }
+    }
+}
+
+impl From<twin::Tunes> for Tunes {
+    fn from(tunes: twin::Tunes) -> Self {
+        Self { x: tunes.x, y: tunes.y, sigma: None }
+    }
+}
+
+impl fmt::Display for Tunes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.sigma {
+            Some(sigma) => write!(f, "{:.4} ± {:.4}, {:.4} ± {:.4}", self.x, sigma.x, self.y, sigma.y),
+            None => write!(f, "{:.4} {:.4}", self.x, self.y),
+        }
+    }
 }
 
 /// Tunes as the meter measured them, with the model's integer parts; none without enough readings of it.
@@ -94,5 +127,5 @@ pub(super) fn tunes(ring: &Ring, vars: &[Var], supplies: &[f64]) -> Option<Tunes
     let params: Vec<f64> = vars.iter().map(|v| v.mean.ln()).collect();
     let ring = ring.with_strengths(&ring.strengths(&params, supplies));
     let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok()?.tunes().ok()?;
-    Some(Tunes { x: tunes.x, y: tunes.y })
+    Some(tunes.into())
 }
