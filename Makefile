@@ -8,7 +8,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks schema
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -184,6 +184,9 @@ slurm: ## an ensemble over dask-jobqueue on a Slurm of one node, one of two jobs
 
 notebooks: ## the notebooks in docs/python anew, in the environment that make python leaves
 	.venv-python/bin/python python/notebooks/render.py
+
+schema: toolchain ## the JSON schemas of all commands anew, in docs/schema
+	BLESS=1 cargo test --locked --release --workspace --test schema the_committed
 
 docs: ## documentation of all crates, in target/doc
 	cargo doc --locked --workspace --no-deps

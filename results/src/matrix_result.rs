@@ -8,13 +8,14 @@ use measured::believed::{Believed, Value};
 use measured::straight::DEAD;
 use measured::unknowns::{Groups, Unknown, name};
 use measured::{Fit, Folder, Kind, Wiring};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::fit_result::{Monitor, Tunes};
 use crate::output::{fill, table};
 
 /// Strength factors and instruments of a measured matrix. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct MatrixFit {
     pub recording: String,
@@ -44,14 +45,14 @@ pub struct MatrixFit {
     pub has_ended: bool,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Cable {
     pub kind: &'static str,
     pub at: String,
 }
 
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct MatrixVar {
     pub name: String,
@@ -64,7 +65,7 @@ pub struct MatrixVar {
     pub q975: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Other {
     pub kind: &'static str,
@@ -76,7 +77,7 @@ pub struct Other {
     pub sigma: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct BlockError {
     pub block: &'static str,
@@ -302,7 +303,7 @@ impl fmt::Display for MatrixFit {
 }
 
 /// What changed. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Comparison {
     pub changes: Vec<ChangeOfOne>,
@@ -312,7 +313,7 @@ pub struct Comparison {
     pub sentence: String,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct ChangeOfOne {
     pub name: String,
@@ -329,7 +330,7 @@ pub struct ChangeOfOne {
 }
 
 /// A change of something else. A cable has no size.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct OtherChange {
     pub kind: &'static str,
