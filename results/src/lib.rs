@@ -39,6 +39,7 @@ mod optics;
 pub mod output;
 mod record;
 mod response_result;
+mod schema;
 
 pub use campaign::{campaign, expect_modelled, not_modelled, recording, strays, tables};
 pub use check_result::CheckResult;
@@ -50,8 +51,10 @@ pub use fit_result::{FitResult, Monitor, Timing, Tunes, TunesMeasured, Var, stat
 pub use frames_result::Written;
 pub use import_result::Imported;
 pub use matrix::{DiagnosedMatrix, FittedMatrix};
+pub use matrix_diagnosis::MatrixDiagnosis;
 pub use matrix_page::page_of as comparison_page;
-pub use matrix_result::{Comparison, StatedModel};
+pub use matrix_result::{Comparison, MatrixFit, StatedModel};
 pub use optics::OpticsAt;
 pub use record::{EstimateRecord, Names, ReadingUse, Remarked};
 pub use response_result::{ResponseResult, factors};
+pub use schema::schema;

@@ -6,6 +6,7 @@ use measured::believed::Departure;
 use measured::diagnose::{Alternative, Diagnosis, Finding, Imperfection, What};
 use measured::held_out::HeldOut;
 use measured::{Against, Fit, Folder, Kind, Wiring};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Rf;
 
@@ -19,7 +20,7 @@ const SAID: usize = 6;
 const LISTED: usize = 12;
 
 /// What a matrix's model lacks. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct MatrixDiagnosis {
     pub recording: String,
@@ -43,7 +44,7 @@ pub struct MatrixDiagnosis {
 }
 
 /// Something that was found.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct MatrixFinding {
     pub kind: &'static str,
@@ -60,7 +61,7 @@ pub struct MatrixFinding {
     pub sentence: String,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct AlternativeResult {
     pub kind: &'static str,
@@ -71,7 +72,7 @@ pub struct AlternativeResult {
     pub probability: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct ImperfectionResult {
     pub kind: &'static str,
@@ -84,7 +85,7 @@ pub struct ImperfectionResult {
     pub unit: &'static str,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct LimitResult {
     pub kind: &'static str,
@@ -94,7 +95,7 @@ pub struct LimitResult {
     pub unit: &'static str,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct UnexplainedResult {
     pub at: String,
@@ -103,7 +104,7 @@ pub struct UnexplainedResult {
 }
 
 /// Elements predicted without themselves, by the fit as LOCO has it and with what was found.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Predictions {
     pub before: PredictionResult,
@@ -112,7 +113,7 @@ pub struct Predictions {
     pub elpd_gain_se: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct PredictionResult {
     /// By the stated noise.

@@ -8,6 +8,7 @@ use measured::believed::{Believed, Value};
 use measured::straight::DEAD;
 use measured::unknowns::{Groups, Unknown, name};
 use measured::{Fit, Folder, Kind, Wiring};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::fit_result::{Monitor, Tunes};
@@ -15,7 +16,7 @@ use crate::optics::OpticsAt;
 use crate::output::{fill, table};
 
 /// Strength factors and instruments of a measured matrix. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct MatrixFit {
     pub recording: String,
@@ -48,14 +49,14 @@ pub struct MatrixFit {
     pub has_ended: bool,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Cable {
     pub kind: &'static str,
     pub at: String,
 }
 
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct MatrixVar {
     pub name: String,
@@ -68,7 +69,7 @@ pub struct MatrixVar {
     pub q975: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Other {
     pub kind: &'static str,
@@ -80,7 +81,7 @@ pub struct Other {
     pub sigma: f64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct BlockError {
     pub block: &'static str,
@@ -307,7 +308,7 @@ impl fmt::Display for MatrixFit {
 }
 
 /// What changed. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Comparison {
     pub changes: Vec<ChangeOfOne>,
@@ -317,7 +318,7 @@ pub struct Comparison {
     pub sentence: String,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct ChangeOfOne {
     pub name: String,
@@ -334,7 +335,7 @@ pub struct ChangeOfOne {
 }
 
 /// A change of something else. A cable has no size.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct OtherChange {
     pub kind: &'static str,

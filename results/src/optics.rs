@@ -2,11 +2,12 @@
 
 use core::f64::consts::TAU;
 
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::{Kind, Ring, Twiss};
 
 /// Optics at the entrance of a monitor or of a quadrupole, on momentum. Field names are those of the command's JSON.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct OpticsAt {
     pub name: String,

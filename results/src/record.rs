@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use estimator::{MonitorState, Remarks};
 use inference::stream::Estimate;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use twin::Ring;
 
@@ -39,7 +40,7 @@ pub enum ReadingUse {
 }
 
 /// How many frames each remark was made of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Remarked {
     /// No beam, or one that the model does not know: nothing in the frame was used.
     pub put_aside_frames: u32,

@@ -4,13 +4,14 @@ use core::fmt;
 use std::collections::BTreeMap;
 
 use nalgebra::DMatrix;
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::{MachineResponse, Ring};
 
 use crate::output::table;
 
 /// How the orbit responds. Field names are those of the command's JSON.
-#[derive(Serialize)]
+#[derive(Serialize, JsonSchema)]
 pub struct ResponseResult {
     machine: String,
     effects: Vec<String>,

@@ -4,6 +4,7 @@ use inference::LaplaceError;
 use inference::{Laplace, Posterior, Prior, Readings, ResponseModel, TuneUse, stream};
 use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Reference, Section, Series, Table};
+use schemars::JsonSchema;
 use serde::Serialize;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
@@ -12,7 +13,7 @@ use super::sampling::Sampling;
 use super::{Sampled, StudyError};
 
 /// One Laplace approximation beside the reference.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Comparison {
     /// `green-on-device`, `green-on-host` or `twin`.
     pub name: &'static str,
@@ -27,7 +28,7 @@ pub struct Comparison {
 }
 
 /// One var of a comparison.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct LaplaceRow {
     /// Name.
     pub name: String,

@@ -21,6 +21,7 @@ use inference::nuts::{NutsError, NutsSettings};
 use inference::simulate::VarsError;
 use inference::{BatchError, Campaign, FittedTune, Readings, Recording, StreamError, Summary, TuneUse};
 use report::Page;
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 
@@ -50,7 +51,7 @@ pub struct Study {
 }
 
 /// The numbers of a study.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Numbers {
     /// The recording.
     pub recording: String,
@@ -74,7 +75,7 @@ pub struct Numbers {
 }
 
 /// One tune of the ring at the MAP, and as measured.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, JsonSchema)]
 pub struct TuneNumbers {
     /// Plane, `x` or `y`.
     pub plane: &'static str,
@@ -85,7 +86,7 @@ pub struct TuneNumbers {
 }
 
 /// One subset of the data.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct SubsetNumbers {
     /// The settings.
     pub kind: String,
@@ -96,7 +97,7 @@ pub struct SubsetNumbers {
 }
 
 /// One var of a posterior.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct VarNumbers {
     /// Name.
     pub name: String,

@@ -6,6 +6,7 @@
 
 use inference::Recording;
 use report::{Axes, Band, Figure, Reference, Section, Series, Table};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 
@@ -16,7 +17,7 @@ use super::subsets::Subsets;
 const CLOSE: f64 = 0.3;
 
 /// One var, published and found.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Beside {
     /// Name.
     pub name: String,

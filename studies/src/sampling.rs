@@ -3,6 +3,7 @@
 use core::ops::ControlFlow;
 use std::sync::Arc;
 
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 
@@ -14,7 +15,7 @@ use report::{Section, Table};
 use super::{Sampled, StudyError};
 
 /// One sampled posterior.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct RunNumbers {
     /// What it was.
     pub name: String,

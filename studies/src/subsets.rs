@@ -7,6 +7,7 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand::seq::IndexedRandom;
 use report::{Axes, Band, Figure, Reference, Section, Table};
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::sampling::Sampling;
@@ -27,7 +28,7 @@ const DRAWN: [(Kind, usize); 4] =
     [(Kind::ZeroToEither, 8), (Kind::ZeroToPlus, 4), (Kind::ZeroToMinus, 4), (Kind::MinusToPlus, 4)];
 
 /// Standard deviations of the vars in one kind of subset.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Widths {
     /// The settings.
     pub kind: String,
@@ -36,7 +37,7 @@ pub struct Widths {
 }
 
 /// Standard deviation of one var.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Width {
     /// Its name.
     pub name: String,

@@ -5,6 +5,7 @@ use inference::quantile;
 use inference::recording::Row;
 use inference::{Reduced, ResponseModel};
 use report::{Section, Table};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::OrbitError;
 
@@ -16,7 +17,7 @@ use super::sampling::Sampling;
 const STANDS_OUT: f64 = 5.0;
 
 /// A reading at fault.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 pub struct Fault {
     /// Frame.
     pub sequence: u32,

@@ -5,13 +5,14 @@ use std::time::Instant;
 
 use diagnosis::{DataError, Diagnosis, Finding, Verdict};
 use inference::Recording;
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 
 use crate::score::{Grade, Truth};
 
 /// Scores of recordings. Field names are those of the JSON of `orbitcal challenge`.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Challenge {
     pub recordings: Vec<Scored>,
@@ -30,7 +31,7 @@ pub struct Challenge {
 }
 
 /// One recording, scored.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Scored {
     pub recording: String,

@@ -8,6 +8,7 @@
 //! Source of the effective number: L. Kish, Survey Sampling (Wiley, 1965), section 8.2.
 
 use diagnosis::{ODDS, UNMODELLED};
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use crate::outcome::Outcome;
@@ -15,7 +16,7 @@ use crate::share::Share;
 use crate::stated::{SORTS, Sort, Stated};
 
 /// Shares of the sorts of campaigns, which add up to 1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, JsonSchema)]
 pub struct Mix([f64; SORTS]);
 
 /// What the search takes for granted.
@@ -28,7 +29,7 @@ const MIXES: [Mix; 3] = [ASSUMED, Mix([0.9, 0.08, 0.02]), Mix([0.1, 0.6, 0.3])];
 const BINS: [[f64; 2]; 6] = [[0.0, 0.5], [0.5, 0.7], [0.7, 0.85], [0.85, 0.95], [0.95, 0.99], [0.99, 1.01]];
 
 /// How often stated probabilities are true in one mix.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Calibration {
     /// Shares of empty campaigns, of effects of the library, of other physics.
     pub mix: Mix,
@@ -39,7 +40,7 @@ pub struct Calibration {
 }
 
 /// How often the stated probabilities of one bin are true.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Reliability {
     /// Stated probability, from and to.
     pub bin: [f64; 2],

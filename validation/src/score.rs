@@ -5,6 +5,7 @@ use std::path::Path;
 
 use diagnosis::{DECISIVE, Diagnosis, Finding, Term, Vars, Verdict};
 use nalgebra::DVector;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use twin::limits::{self, FILE};
 use twin::{EffectError, EffectKind, Ring};
@@ -67,7 +68,7 @@ struct Entry {
 }
 
 /// How right a verdict is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Grade {
     /// All effects named at their places, and no other; or nothing, where there is nothing.
@@ -85,7 +86,7 @@ pub enum Grade {
 }
 
 /// What became of one effect.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Fate {
     /// Named at its place, in a verdict that stands.

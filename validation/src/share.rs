@@ -1,5 +1,6 @@
 //! Shares of campaigns, with their limits.
 
+use schemars::JsonSchema;
 use serde::Serialize;
 use statrs::distribution::{Beta, ContinuousCDF};
 
@@ -8,7 +9,7 @@ use crate::outcome::Outcome;
 /// Share of successes among trials, with the 95 % limits of Clopper and Pearson.
 ///
 /// Source: C. Clopper and E. Pearson, Biometrika 26 (1934) 404.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, JsonSchema)]
 pub struct Share {
     /// Successes.
     pub of: usize,

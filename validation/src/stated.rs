@@ -1,11 +1,12 @@
 //! What a diagnosis states as the most likely cause, and with which probability.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::case::Class;
 
 /// What may be the matter: nothing, an effect of the library, or other physics.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[allow(missing_docs)] // named after what they are
 pub enum Sort {
@@ -18,7 +19,7 @@ pub enum Sort {
 pub const SORTS: usize = 3;
 
 /// The most likely cause of the least certain finding.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 pub struct Stated {
     /// Kind and place, `nothing` or `unknown`.
     pub cause: String,

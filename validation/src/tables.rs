@@ -4,6 +4,7 @@ use core::fmt::Write;
 use std::collections::BTreeMap;
 
 use diagnosis::Verdict;
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use crate::case::Class;
@@ -14,7 +15,7 @@ use crate::share::Share;
 use crate::unmodelled::UnmodelledKind;
 
 /// Fates of the effects of one row.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after the fates
 pub struct Fates {
     pub named: usize,
@@ -24,7 +25,7 @@ pub struct Fates {
 }
 
 /// What became of physics outside the library.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, JsonSchema)]
 pub struct Unknown {
     /// Called unexplained or ambiguous, or a monitor said to wander.
     pub undecided: Share,
@@ -37,7 +38,7 @@ pub struct Unknown {
 }
 
 /// What became of campaigns on ideal machines, or on machines with ordinary imperfections.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct OfMachines {
     /// Number of campaigns.
     pub campaigns: usize,
@@ -58,7 +59,7 @@ pub struct OfMachines {
 }
 
 /// All tables.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 pub struct Tables {
     /// On ideal machines, and on machines with ordinary imperfections.
     pub machines: [OfMachines; 2],

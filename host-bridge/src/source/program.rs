@@ -62,16 +62,24 @@ impl Read for Running {
     }
 }
 
-impl Drop for Running {
-    fn drop(&mut self) {
-        // the end of its input is the end of the process
+impl Running {
+    /// End its input, which is the end of the process; one that takes longer than this is killed. True if it ended by itself.
+    fn end(&mut self, patience: Duration) -> bool {
         let _ = self.line.shutdown(std::net::Shutdown::Both);
-        let deadline = Instant::now() + END;
+        let deadline = Instant::now() + patience;
         while matches!(self.process.try_wait(), Ok(None)) && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(10));
         }
+        let has_ended = matches!(self.process.try_wait(), Ok(Some(_)));
         let _ = self.process.kill();
         let _ = self.process.wait();
+        has_ended
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.end(END);
     }
 }
 
@@ -101,11 +109,17 @@ mod tests {
     #[test]
     fn one_that_goes_on_ends_with_the_line() {
         let folder = tempfile::tempdir().unwrap();
-        let running = program(&folder, "read line; cat > /dev/null").start().unwrap();
-        let (id, start) = (running.process.id(), Instant::now());
-        drop(running);
-        assert!(start.elapsed() < END, "it was killed");
+        let mut running = program(&folder, "read line; cat > /dev/null").start().unwrap();
+        let id = running.process.id();
+        assert!(running.end(Duration::from_secs(60)), "it was killed");
         assert!(!std::path::Path::new(&format!("/proc/{id}")).exists());
+    }
+
+    #[test]
+    fn one_that_does_not_end_is_killed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut running = program(&folder, "read line; exec sleep 600").start().unwrap();
+        assert!(!running.end(Duration::ZERO));
     }
 
     #[test]

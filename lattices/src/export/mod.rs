@@ -16,10 +16,11 @@ mod xsuite;
 pub use calibration::{Calibration, CalibrationError};
 pub use lattice::{Channel, ExportError, Lattice};
 
+use schemars::JsonSchema;
 use serde::Serialize;
 
 /// Lattice formats.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
     /// A sequence for MAD-X.

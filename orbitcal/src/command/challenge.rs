@@ -5,6 +5,7 @@ use std::path::Path;
 
 use results::output::{fill, table};
 use results::{CommandError, recording};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 use validation::{Challenge, Scored, Truth, folders};
@@ -52,7 +53,7 @@ fn scored(ring: &Ring, folder: &Path) -> Result<Scored, CommandError> {
 }
 
 /// Scores for a person.
-#[derive(Serialize)]
+#[derive(Serialize, JsonSchema)]
 #[serde(transparent)]
 struct Shown(Challenge);
 

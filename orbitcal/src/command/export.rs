@@ -5,14 +5,15 @@ use std::path::{Path, PathBuf};
 
 use lattices::export::{self, Calibration, ExportError, Format, Lattice};
 use results::{Tunes, output};
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::{CommandError, check_outputs, deliver, machine};
 use crate::cli::Export;
 
 /// What was written. Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
-struct ExportResult<'l> {
+#[derive(Debug, Serialize, JsonSchema)]
+pub(super) struct ExportResult<'l> {
     file: PathBuf,
     format: Format,
     machine: &'l str,

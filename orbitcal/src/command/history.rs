@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use host_bridge::config::Config;
 use host_bridge::history::{self, History, Row, Span};
 use results::output::{self, OutputError, table};
-use serde_json::{Value, json};
-use shared_memory::State;
+use schemars::JsonSchema;
+use serde::Serialize;
 
 use super::{CommandError, check_outputs};
 use crate::cli;
@@ -29,7 +29,7 @@ pub fn run(options: &cli::History) -> Result<(), CommandError> {
         output::warn(format_args!("{}: {} damaged lines are left out", folder.display(), history.damaged));
     }
     if let Some(path) = &options.json {
-        output::json(path, &as_json(&history, &vars))?;
+        output::json(path, &HistoryResult::of(&history, &vars))?;
     }
     if let Some(path) = &options.csv {
         let text = as_csv(&history, &vars);
@@ -132,30 +132,79 @@ fn time(time_ms: u64) -> String {
     moment.map_or_else(|| time_ms.to_string(), |moment| moment.strftime("%Y-%m-%d %H:%M:%S").to_string())
 }
 
-fn as_json(history: &History, vars: &[usize]) -> Value {
-    let number = |value: f32| if value.is_finite() { json!(value) } else { Value::Null };
-    let row = |row: &Row| {
-        let values = vars.iter().map(|var| {
-            let [mean, sigma] = history.var(row, *var);
-            json!({"name": history.columns.vars[*var], "mean": number(mean), "sigma": number(sigma)})
-        });
-        let unwell =
-            history.unwell(row).map(|(name, state): (&str, State)| json!({"name": name, "state": state.word()}));
-        json!({
-            "time": time(row.time_ms).replace(' ', "T") + "Z",
-            "time_ms": row.time_ms,
-            "sequence": row.sequence,
-            "frames": row.frames,
-            "usable": row.is_usable,
-            "mismatch": row.mismatch,
-            "chi_square": number(row.chi_square[0]),
-            "degrees_of_freedom": number(row.chi_square[1]),
-            "nis_per_reading": number(row.nis_per_reading),
-            "vars": values.collect::<Vec<_>>(),
-            "not_ok": unwell.collect::<Vec<_>>(),
-        })
-    };
-    json!({"rows": history.rows.iter().map(row).collect::<Vec<_>>(), "damaged": history.damaged})
+/// What the history holds. Field names are those of the command's JSON.
+#[derive(Debug, Serialize, JsonSchema)]
+pub(super) struct HistoryResult<'h> {
+    rows: Vec<RowResult<'h>>,
+    /// Lines that could not be read.
+    damaged: u64,
+}
+
+/// An estimate; a number that the daemon did not have is null.
+#[derive(Debug, Serialize, JsonSchema)]
+struct RowResult<'h> {
+    /// In UTC, to the second.
+    time: String,
+    time_ms: u64,
+    sequence: u32,
+    frames: u32,
+    usable: bool,
+    mismatch: bool,
+    chi_square: Option<f32>,
+    degrees_of_freedom: Option<f32>,
+    nis_per_reading: Option<f32>,
+    vars: Vec<VarResult<'h>>,
+    /// Monitors and correctors that were not ok.
+    not_ok: Vec<Unwell<'h>>,
+}
+
+#[derive(Debug, Serialize, JsonSchema)]
+struct VarResult<'h> {
+    name: &'h str,
+    mean: Option<f32>,
+    sigma: Option<f32>,
+}
+
+#[derive(Debug, Serialize, JsonSchema)]
+struct Unwell<'h> {
+    name: &'h str,
+    state: &'static str,
+}
+
+impl<'h> HistoryResult<'h> {
+    fn of(history: &'h History, vars: &[usize]) -> Self {
+        Self {
+            rows: history.rows.iter().map(|row| RowResult::of(history, row, vars)).collect(),
+            damaged: history.damaged,
+        }
+    }
+}
+
+impl<'h> RowResult<'h> {
+    fn of(history: &'h History, row: &'h Row, vars: &[usize]) -> Self {
+        let [chi_square, degrees_of_freedom] = row.chi_square.map(finite);
+        let var = |var: &usize| {
+            let [mean, sigma] = history.var(row, *var).map(finite);
+            VarResult { name: &history.columns.vars[*var], mean, sigma }
+        };
+        Self {
+            time: time(row.time_ms).replace(' ', "T") + "Z",
+            time_ms: row.time_ms,
+            sequence: row.sequence,
+            frames: row.frames,
+            usable: row.is_usable,
+            mismatch: row.mismatch,
+            chi_square,
+            degrees_of_freedom,
+            nis_per_reading: finite(row.nis_per_reading),
+            vars: vars.iter().map(var).collect(),
+            not_ok: history.unwell(row).map(|(name, state)| Unwell { name, state: state.word() }).collect(),
+        }
+    }
+}
+
+fn finite(value: f32) -> Option<f32> {
+    Some(value).filter(|value| value.is_finite())
 }
 
 fn as_csv(history: &History, vars: &[usize]) -> String {

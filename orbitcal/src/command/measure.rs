@@ -8,6 +8,7 @@ use control::{Control, Epics, Journal, Plan, Step, measure, preflight, recording
 use host_bridge::stop::Stop;
 use inference::Recording;
 use results::output::{self, fill};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 
@@ -15,8 +16,8 @@ use super::{CommandError, check_outputs, deliver, machine, progress};
 use crate::cli::Measure;
 
 /// Field names are those of the command's JSON.
-#[derive(Debug, Serialize)]
-struct MeasureResult {
+#[derive(Debug, Serialize, JsonSchema)]
+pub(super) struct MeasureResult {
     recording: String,
     frames: usize,
     settings: usize,
@@ -30,8 +31,8 @@ struct MeasureResult {
 }
 
 /// What would be done.
-#[derive(Debug, Serialize)]
-struct DryRun {
+#[derive(Debug, Serialize, JsonSchema)]
+pub(super) struct DryRun {
     settings: Vec<String>,
     frames: usize,
     channels: usize,

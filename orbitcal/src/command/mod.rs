@@ -15,6 +15,7 @@ mod measure;
 mod replay;
 mod request;
 mod response;
+mod schemas;
 mod serve;
 mod simulate;
 mod study;
@@ -42,6 +43,8 @@ use serde::Serialize;
 use shared_memory::{PublishError, Publisher};
 use training::Tables;
 use twin::{LatticeError, Ring};
+
+pub use schemas::schemas;
 
 use crate::cli::{Cli, Command, Common, CoreModel, Priors, Publishing};
 

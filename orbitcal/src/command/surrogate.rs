@@ -4,6 +4,7 @@ use core::fmt;
 use std::path::Path;
 
 use results::output::{fill, table};
+use schemars::JsonSchema;
 use serde::Serialize;
 use training::SurrogateError;
 use training::network::checkpoint;
@@ -15,12 +16,12 @@ use twin::Ring;
 use super::{CommandError, check_outputs, deliver, machine, progress};
 use crate::cli::{Surrogate, SurrogateAction};
 
-#[derive(Serialize)]
-struct Check {
+#[derive(Serialize, JsonSchema)]
+pub(super) struct Check {
     surrogates: Vec<Entry>,
 }
 
-#[derive(Serialize)]
+#[derive(Serialize, JsonSchema)]
 struct Entry {
     name: &'static str,
     plane: char,

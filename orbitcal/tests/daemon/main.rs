@@ -1,5 +1,6 @@
 //! `orbitcal serve CONFIG.toml` as operators run it: a process that is fed, read through shared memory, and killed.
 
+mod attack;
 mod clients;
 mod faults;
 mod history;

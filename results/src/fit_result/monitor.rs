@@ -4,13 +4,14 @@ use std::collections::BTreeMap;
 
 use estimator::{Health, MonitorState};
 use inference::Excluded;
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 
 use crate::record::EstimateRecord;
 
 /// State of one monitor.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Monitor {
     pub name: String,

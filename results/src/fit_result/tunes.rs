@@ -5,6 +5,7 @@ use core::fmt;
 use inference::TUNE_CALIBRATION;
 use inference::recording::Row;
 use inference::{FittedTune, Meter, Recording};
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::{Hold, Optics, Ring};
 
@@ -16,7 +17,7 @@ const DISAGREE: f64 = 4.0;
 const SCATTERS: f64 = 30.0;
 
 /// Tunes of the twin at the means, at the recording's mean supply currents.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Tunes {
     pub x: f64,
@@ -27,7 +28,7 @@ pub struct Tunes {
 }
 
 /// Standard deviations of both tunes.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct TunesSigma {
     pub x: f64,
@@ -57,7 +58,7 @@ impl fmt::Display for Tunes {
 }
 
 /// Tunes as the meter measured them, with the model's integer parts; none without enough readings of it.
-#[derive(Debug, Clone, Copy, Default, Serialize)]
+#[derive(Debug, Clone, Copy, Default, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct TunesMeasured {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -67,7 +68,7 @@ pub struct TunesMeasured {
 }
 
 /// Mean of what the meter says of one tune, and its standard deviation, the meter's calibration included.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct TuneMeasured {
     pub mean: f64,

@@ -2,11 +2,12 @@
 
 use estimator::Marginal;
 use inference::Summary;
+use schemars::JsonSchema;
 use serde::Serialize;
 use twin::Ring;
 
 /// One quadrupole factor: mean, standard deviation and quantiles of its truncated posterior [1].
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, JsonSchema)]
 #[allow(missing_docs)] // named after what they are
 pub struct Var {
     pub name: String,
