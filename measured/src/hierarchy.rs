@@ -8,16 +8,17 @@
 use core::cmp::Ordering;
 use std::collections::BTreeMap;
 
-use nalgebra::{Cholesky, DMatrix, DVector};
+use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
 use crate::family::{Family, Marginal, ORDINARY, UNCHANGED, class, families, sort};
 use crate::fit::{Fit, Settings, learn_missed};
 use crate::folder::{Folder, Row};
+use crate::linear::{Factor, inverse};
 use crate::missed::Missed;
 use crate::model::{Model, Prediction};
-use crate::normal::{Normal, Places, inverse, times};
+use crate::normal::{Normal, Places, times};
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
 
@@ -409,7 +410,7 @@ impl Start {
         while *damping < STUCK {
             let mut damped = whole.clone();
             (0..downhill.len()).for_each(|i| damped[(i, i)] *= 1.0 + *damping);
-            let step = Cholesky::new(damped).ok_or(MeasuredError::Singular(0))?.solve(&downhill);
+            let step = Factor::of(&damped).ok_or(MeasuredError::Singular(0))?.solve(&downhill);
             let there = &self.values + step.component_mul(&scene.width);
             match scene.model.predict(&self.unknowns, &there) {
                 Ok(better) if distance(&there, &better) <= now => {

@@ -16,6 +16,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
+use crate::linear::{product, transposed_product};
 use crate::missed::Missed;
 use crate::model::Prediction;
 use crate::normal::{Normal, Places, covariance};
@@ -62,8 +63,8 @@ impl Uncertainty {
         let together = together(places, at, &slope, n);
         let alone = Normal::of(places, at, &nothing, &slope.component_mul(&slope), n).matrix;
         let mut all = Self { independent, sigma: DVector::zeros(n), together, alone, information };
-        let of_lines = all.together.tr_mul(&all.independent);
-        let [of_elements, of_data] = [&all.alone, &all.information].map(|matrix| matrix * &all.independent);
+        let of_lines = transposed_product(&all.together, &all.independent);
+        let [of_elements, of_data] = [&all.alone, &all.information].map(|matrix| product(matrix, &all.independent));
         all.sigma = DVector::from_fn(n, |i, _| {
             let direction = all.independent.column(i);
             let [elements, data] = [&of_elements, &of_data].map(|matrix| direction.dot(&matrix.column(i)));
@@ -97,10 +98,14 @@ fn variance(lines: f64, elements: f64, of_data: f64, independent: f64) -> f64 {
 fn together(places: &Places, at: &Prediction, slope: &DMatrix<f64>, unknowns: usize) -> DMatrix<f64> {
     let (rows, columns) = slope.shape();
     let mut together = DMatrix::zeros(unknowns, rows + columns);
-    for (unknown, by) in at.by_machine.iter().enumerate() {
-        let said = by.component_mul(slope);
-        said.row_iter().enumerate().for_each(|(row, one)| together[(unknown, row)] = one.sum());
-        said.column_iter().enumerate().for_each(|(column, one)| together[(unknown, rows + column)] = one.sum());
+    for column in 0..columns {
+        let mut said = at.by_machine.column(column);
+        for (unknown, mut said) in said.column_iter_mut().enumerate() {
+            said.component_mul_assign(&slope.column(column));
+            together[(unknown, rows + column)] = said.sum();
+        }
+        let mut of_rows = together.view_mut((0, 0), (said.ncols(), rows));
+        of_rows += said.transpose();
     }
     for (row, column) in (0..columns).flat_map(|column| (0..rows).map(move |row| (row, column))) {
         for (unknown, by) in places.instruments(at, row, column) {
