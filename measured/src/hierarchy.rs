@@ -15,7 +15,7 @@ use crate::error::MeasuredError;
 use crate::family::{Family, Marginal, ORDINARY, UNCHANGED, class, families, sort};
 use crate::fit::{Fit, Settings, learn_missed};
 use crate::folder::{Folder, Row};
-use crate::linear::{Factor, inverse};
+use crate::linear::{Factor, inverse, product};
 use crate::missed::Missed;
 use crate::model::{Model, Prediction};
 use crate::normal::{Normal, Places, times};
@@ -130,13 +130,29 @@ impl Posterior {
                 continue;
             }
             (least, gained) = (least.max(share * first.gain), gained + first.gain);
-            families[first.number] = family.with_scale(first.scale);
-            *self = Self::of_families(self.information.clone(), self.slope.clone(), families)?;
+            let scaled = family.with_scale(first.scale);
+            self.add_precision(&family.members, &(scaled.precision() - family.precision()))?;
+            families[first.number] = scaled;
             first.gain = 0.0;
             let number = first.number;
             turns.iter_mut().filter(|turn| turn.number != number).for_each(|turn| turn.is_told = false);
         }
         Ok(gained)
+    }
+
+    /// With a prior that is more precise by `P` for some members: with `C` the covariance, `C_m` its columns of these and `C_mm` their own block,
+    ///
+    /// `C - C_m (1 + P C_mm)^-1 P C_m^T`,
+    ///
+    /// products with few columns in place of an inverse of all.
+    fn add_precision(&mut self, members: &[usize], further: &DMatrix<f64>) -> Result<(), MeasuredError> {
+        let columns = self.covariance.select_columns(members);
+        let own = columns.select_rows(members);
+        let inner = DMatrix::identity(members.len(), members.len()) + further * own;
+        let inner = inner.lu().solve(further).ok_or(MeasuredError::Singular(0))?;
+        self.covariance -= product(&product(&columns, &inner), &columns.transpose());
+        self.values = &self.covariance * &self.slope;
+        Ok(())
     }
 
     /// What the data say of the members of a family, everything else adapting.
