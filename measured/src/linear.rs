@@ -8,7 +8,7 @@ use faer::{Accum, Conj, MatMut, MatRef, Par, Side};
 use nalgebra::{DMatrix, DVector};
 
 /// Threads of one sum.
-const LANES: usize = 4;
+pub const LANES: usize = 4;
 
 /// What a function makes of some items, cut into lanes.
 pub fn in_lanes<T: Send>(items: &[usize], each: impl Fn(&[usize]) -> T + Sync) -> Vec<T> {
