@@ -2,10 +2,11 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use crate::arrow::Arrow;
 use crate::data::residual;
 use crate::error::MeasuredError;
 use crate::model::{Model, Prediction};
-use crate::normal::{Normal, Places, in_widths, inverse, times};
+use crate::normal::{Normal, Places, in_widths, times};
 use crate::unknowns::Unknown;
 
 /// Steps of one descent; those of measured rings take 5 to 60.
@@ -41,6 +42,7 @@ pub fn descend(
 ) -> Result<Descent, MeasuredError> {
     let n = unknowns.len();
     let places = Places::of(unknowns, measured.nrows(), measured.ncols());
+    let apart = places.apart();
     let width = DVector::from_iterator(n, unknowns.iter().map(|one| one.width));
     let mean = DVector::from_iterator(n, unknowns.iter().map(|one| one.mean));
     let off = |values: &DVector<f64>| (values - &mean).component_div(&width);
@@ -52,7 +54,7 @@ pub fn descend(
         let matrix = in_widths(normal.matrix, &width);
         let slope = normal.slope.component_mul(&width) - off(&values);
         let now = normal.chi2 + off(&values).norm_squared();
-        let factor = matrix.clone().cholesky().ok_or(MeasuredError::Singular(step))?;
+        let factor = Arrow::of(&matrix, &apart).ok_or(MeasuredError::Singular(step))?;
         let has_ended = slope.dot(&factor.solve(&slope)) < ENOUGH.max(ENOUGH_SHARE * now);
         let further = (!has_ended && step < STEPS).then(|| {
             let sum = |values: &DVector<f64>, at: &Prediction| {
@@ -62,7 +64,7 @@ pub fn descend(
             further(
                 model,
                 unknowns,
-                (&matrix, &slope),
+                (&matrix, &slope, &apart),
                 &mut damping,
                 |moved| &values + moved.component_mul(&width),
                 |v, at| sum(v, at) < now,
@@ -71,7 +73,7 @@ pub fn descend(
         match further.flatten() {
             Some(better) => (values, prediction) = better,
             None => {
-                let covariance = times(inverse(&matrix).ok_or(MeasuredError::Singular(step))?, &width);
+                let covariance = times(factor.inverse(), &width);
                 return Ok(Descent { values, covariance, prediction, steps: step, has_ended });
             }
         }
@@ -84,7 +86,7 @@ pub fn descend(
 fn further(
     model: &Model,
     unknowns: &[Unknown],
-    (matrix, slope): (&DMatrix<f64>, &DVector<f64>),
+    (matrix, slope, apart): (&DMatrix<f64>, &DVector<f64>, &[Vec<usize>]),
     damping: &mut f64,
     to: impl Fn(&DVector<f64>) -> DVector<f64>,
     is_better: impl Fn(&DVector<f64>, &Prediction) -> bool,
@@ -94,7 +96,7 @@ fn further(
         for i in 0..slope.len() {
             damped[(i, i)] *= 1.0 + *damping;
         }
-        let values = to(&damped.cholesky()?.solve(slope));
+        let values = to(&Arrow::of(&damped, apart)?.solve(slope));
         match model.predict(unknowns, &values) {
             Ok(at) if is_better(&values, &at) => {
                 *damping = (*damping * 0.1).max(1e-9);

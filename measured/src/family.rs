@@ -21,9 +21,10 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use nalgebra::{DMatrix, DVector};
 
 use crate::folder::Folder;
+use crate::linear::Factor;
 use crate::unknowns::{Groups, Kind, Unknown, holds};
 
 /// Members that a scale can be learnt from; fewer have the prior of the fit each.
@@ -230,13 +231,11 @@ impl Family {
 
     /// `ln` probability of what the data say of the members, and of the scale beforehand; none where rounding leaves no positive curvature.
     pub fn log_evidence(&self, marginal: &Marginal) -> Option<f64> {
-        let factor = |matrix: DMatrix<f64>| Cholesky::new(matrix);
-        let log_root = |factor: &Cholesky<f64, Dyn>| factor.l_dirty().diagonal().map(f64::ln).sum();
         let prior = self.precision();
-        let whole = factor(&prior + &marginal.information)?;
+        let whole = Factor::of(&(&prior + &marginal.information))?;
         let square = (self.ordinary / self.scale).powi(2);
         Some(
-            log_root(&factor(prior)?) - log_root(&whole)
+            Factor::of(&prior)?.log_root() - whole.log_root()
                 + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope))
                 + 0.5 * BEFOREHAND * (square.ln() - square),
         )

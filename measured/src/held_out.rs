@@ -1,10 +1,11 @@
 //! Elements that are predicted without themselves: the matrix is cut into nine parts, some monitors by some correctors, and each is predicted by
 //! the others, to first order about the fit of all.
 
-use nalgebra::{Cholesky, DMatrix, DVector};
+use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
+use crate::linear::Factor;
 use crate::model::Prediction;
 use crate::noise::Noise;
 use crate::normal::{Normal, Places, times};
@@ -74,7 +75,7 @@ impl HeldOut {
         for ([rows, columns], normal) in parts.iter().zip(&normals) {
             let matrix = times(&whole - &normal.matrix, width) + *precision;
             let slope = (&slope - &normal.slope).component_mul(width) - *pull;
-            let step = Cholesky::new(matrix).ok_or(MeasuredError::Singular(0))?.solve(&slope).component_mul(width);
+            let step = Factor::of(&matrix).ok_or(MeasuredError::Singular(0))?.solve(&slope).component_mul(width);
             let moved = places.forward(prediction, &step);
             steps.push(step);
             for &column in columns {

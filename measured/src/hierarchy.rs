@@ -8,16 +8,17 @@
 use core::cmp::Ordering;
 use std::collections::BTreeMap;
 
-use nalgebra::{Cholesky, DMatrix, DVector};
+use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
 use crate::family::{Family, Marginal, ORDINARY, UNCHANGED, class, families, sort};
 use crate::fit::{Fit, Settings};
 use crate::folder::{Folder, Row};
+use crate::linear::{Factor, inverse, product};
 use crate::model::{Model, Prediction};
 use crate::noise::Noise;
-use crate::normal::{Normal, Places, inverse, times};
+use crate::normal::{Normal, Places, times};
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
 
@@ -131,13 +132,29 @@ impl Posterior {
                 continue;
             }
             (least, gained) = (least.max(share * first.gain), gained + first.gain);
-            families[first.number] = family.with_scale(first.scale);
-            *self = Self::of_families(self.information.clone(), self.slope.clone(), families)?;
+            let scaled = family.with_scale(first.scale);
+            self.add_precision(&family.members, &(scaled.precision() - family.precision()))?;
+            families[first.number] = scaled;
             first.gain = 0.0;
             let number = first.number;
             turns.iter_mut().filter(|turn| turn.number != number).for_each(|turn| turn.is_told = false);
         }
         Ok(gained)
+    }
+
+    /// With a prior that is more precise by `P` for some members: with `C` the covariance, `C_m` its columns of these and `C_mm` their own block,
+    ///
+    /// `C - C_m (1 + P C_mm)^-1 P C_m^T`,
+    ///
+    /// products with few columns in place of an inverse of all.
+    fn add_precision(&mut self, members: &[usize], further: &DMatrix<f64>) -> Result<(), MeasuredError> {
+        let columns = self.covariance.select_columns(members);
+        let own = columns.select_rows(members);
+        let inner = DMatrix::identity(members.len(), members.len()) + further * own;
+        let inner = inner.lu().solve(further).ok_or(MeasuredError::Singular(0))?;
+        self.covariance -= product(&product(&columns, &inner), &columns.transpose());
+        self.values = &self.covariance * &self.slope;
+        Ok(())
     }
 
     /// What the data say of the members of a family, everything else adapting.
@@ -420,7 +437,7 @@ impl Start {
         while *damping < STUCK {
             let mut damped = whole.clone();
             (0..downhill.len()).for_each(|i| damped[(i, i)] *= 1.0 + *damping);
-            let step = Cholesky::new(damped).ok_or(MeasuredError::Singular(0))?.solve(&downhill);
+            let step = Factor::of(&damped).ok_or(MeasuredError::Singular(0))?.solve(&downhill);
             let there = &self.values + step.component_mul(&scene.width);
             match scene.model.predict(&self.unknowns, &there) {
                 Ok(better) if distance(&there, &better) <= now => {

@@ -8,12 +8,14 @@
 //! Source: J. Safranek, Nucl. Instrum. Methods A 388 (1997) 27 (LOCO).
 
 pub mod alignment;
+mod arrow;
 pub mod believed;
 pub mod calibrated;
 pub mod compare;
 pub mod conceal;
 pub mod data;
 pub mod departure;
+pub mod derivative;
 pub mod descent;
 pub mod diagnose;
 pub mod error;
@@ -25,6 +27,7 @@ pub mod hierarchy;
 pub mod hold;
 pub mod lattice;
 mod likeness;
+pub mod linear;
 pub mod missed;
 pub mod model;
 pub mod named;

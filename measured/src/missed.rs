@@ -85,9 +85,12 @@ fn share(nu: f64, over: f64, under: f64) -> f64 {
 
 /// `tau` at which the likelihood of the elements is largest: the mean of `r^2` times weight is 1.
 fn scale(elements: &[(f64, f64)], freedom: f64) -> f64 {
+    // with `z = r^2/s^2` an element's `r^2` times weight is `z (nu + 1)/(nu + z)`
+    let squares: Vec<[f64; 2]> = elements.iter().map(|(r, sigma)| [r * r, sigma * sigma]).collect();
     let excess = |scale: f64| {
-        let missed = Missed { scale, freedom };
-        elements.iter().map(|&(r, sigma)| r * r * missed.weight(sigma, r) - 1.0).sum::<f64>()
+        let share = |z: f64| if freedom.is_finite() { (freedom + 1.0) / (freedom + z) } else { 1.0 };
+        let each = squares.iter().map(|[r, sigma]| r / (scale * scale + sigma));
+        each.map(|z| z * share(z) - 1.0).sum::<f64>()
     };
     let (mut low, mut high) = (0.0, elements.iter().map(|(r, _)| r * r).sum::<f64>().sqrt());
     if excess(0.0) <= 0.0 {

@@ -8,8 +8,9 @@
 //! dispersion was measured, is the change of the orbit with the RF frequency.
 
 use nalgebra::{DMatrix, DVector};
-use twin::{Gradient, Hold, Kind as Field, LatticeError, Observer, Optics, Plane, Rf, Ring, Source};
+use twin::{Hold, Kind as Field, LatticeError, Observer, Optics, Plane, Rf, Ring, Source};
 
+use crate::derivative::{ByMachine, Change, Share};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::lattice::{LENSES, lens_names, parts, ring, winding};
@@ -44,8 +45,8 @@ pub struct Model {
 pub struct Prediction {
     /// The matrix [mm], with the dispersion as its last column.
     pub matrix: DMatrix<f64>,
-    /// By strengths, then skew gradients, then further gradients, then the share of a held RF frequency, the same shape each.
-    pub by_machine: Vec<DMatrix<f64>>,
+    /// By strengths, then skew gradients, then further gradients, then the share of a held RF frequency.
+    pub by_machine: ByMachine,
     /// By the gain and by the coupling of the monitor of each row.
     pub by_monitor: [DMatrix<f64>; 2],
     /// By the gain and by the coupling of the corrector of each column, the last one by that of the scale of the RF step.
@@ -171,11 +172,11 @@ impl Model {
     pub fn predict(&self, unknowns: &[Unknown], values: &DVector<f64>) -> Result<Prediction, MeasuredError> {
         let ring = self.at(unknowns, values);
         let instruments = self.instruments(unknowns, values);
-        let gradients = self.gradients_of_factors(unknowns, values, &ring);
-        let held = |hold| Ok::<_, MeasuredError>(self.held(&Optics::of(&ring, hold)?, &instruments, &gradients));
+        let changes = self.changes(&self.gradients_of_factors(unknowns, values, &ring));
+        let held = |hold| Ok::<_, MeasuredError>(self.held(&Optics::of(&ring, hold)?, &instruments, &changes));
         let [momentum, frequency] = [Hold::Momentum { delta: 0.0 }, Hold::Frequency { offset: 0.0 }];
         match (instruments.held_frequency, self.rf) {
-            (Some(share), _) => Ok(held(momentum)?.towards(&held(frequency)?, share)),
+            (Some(share), _) => Ok(held(momentum)?.towards(held(frequency)?, share)),
             (None, Rf::FixedMomentum) => held(momentum),
             (None, Rf::FixedFrequency) => held(frequency),
         }
@@ -211,14 +212,20 @@ impl Model {
     }
 
     /// The prediction of one kind of hold.
-    fn held(&self, optics: &Optics, instruments: &Instruments, gradients: &[Vec<f64>]) -> Prediction {
+    fn held(&self, optics: &Optics, instruments: &Instruments, changes: &[Vec<Share>]) -> Prediction {
         let (read, kicked) =
             (self.observers(optics, &instruments.monitors), self.sources(optics, &instruments.correctors));
         let [own, other] = [[1.0, 0.0], [0.0, 1.0]];
         let rf = instruments.rf;
         Prediction {
             matrix: self.seen(optics, &read, &kicked, rf),
-            by_machine: self.by_magnets(optics, (&read, &kicked), rf, gradients),
+            by_machine: ByMachine::about(
+                optics,
+                changes,
+                (&read, &kicked),
+                self.correctors.iter().map(|(pieces, _)| pieces.len()),
+                self.has_dispersion.then_some(rf * self.rf_step * MILLI),
+            ),
             by_monitor: [own, other]
                 .map(|one| self.seen(optics, &self.observers(optics, &vec![one; self.monitors.len()]), &kicked, rf)),
             by_corrector: [(own, 1.0), (other, 0.0)].map(|(one, rf)| {
@@ -251,42 +258,19 @@ impl Model {
         each
     }
 
-    /// Derivatives of the same by strengths, skew gradients and further gradients.
-    fn by_magnets(
-        &self,
-        optics: &Optics,
-        (observers, sources): (&[Observer], &[Source]),
-        rf: f64,
-        gradients: &[Vec<f64>],
-    ) -> Vec<DMatrix<f64>> {
+    /// What each unknown of a magnet changes, with the gradients of the factors.
+    fn changes(&self, gradients: &[Vec<f64>]) -> Vec<Vec<Share>> {
+        let each = |group: &Vec<usize>, change: Change, share: f64| -> Vec<Share> {
+            group.iter().map(|&at| (at, change, share)).collect()
+        };
         let strengths = self.strengths.iter().zip(gradients).map(|(group, gradients)| {
             let each = group.iter().zip(gradients);
-            each.map(|(&at, &per_unit)| optics.gradient(at).times(per_unit)).collect::<Vec<_>>()
+            each.map(|(&at, &per_unit)| (at, Change::Normal, per_unit)).collect()
         });
-        let skews = self.skews.iter().map(|group| group.iter().map(|&at| optics.skew_gradient(at)).collect());
-        let gradients = self.gradients.iter().map(|group| group.iter().map(|&at| optics.gradient(at)).collect());
-        let lens = |&at: &usize| optics.vertical_focusing(at).times(1.0 / LENSES as f64);
-        let wigglers = self.wigglers.iter().map(|lenses| lenses.iter().map(lens).collect());
-        strengths
-            .chain(skews)
-            .chain(gradients)
-            .chain(wigglers)
-            .map(|gradients| self.by_gradients(optics, (observers, sources), rf, &gradients))
-            .collect()
-    }
-
-    /// Derivative by gradients that change together.
-    fn by_gradients(
-        &self,
-        optics: &Optics,
-        (observers, sources): (&[Observer], &[Source]),
-        rf: f64,
-        gradients: &[Gradient],
-    ) -> DMatrix<f64> {
-        let each = optics.response_jacobian(observers, sources, gradients);
-        let sum = each.into_iter().reduce(|sum, one| sum + one);
-        let offset = || optics.rf_jacobian(observers, gradients).column_sum() * (rf * self.rf_step * MILLI);
-        self.and_dispersion(self.of_correctors(sum.expect("a group has a magnet")), offset)
+        let skews = self.skews.iter().map(|group| each(group, Change::Skew, 1.0));
+        let gradients = self.gradients.iter().map(|group| each(group, Change::Normal, 1.0));
+        let wigglers = self.wigglers.iter().map(|group| each(group, Change::Vertical, 1.0 / LENSES as f64));
+        strengths.chain(skews).chain(gradients).chain(wigglers).collect()
     }
 
     /// A matrix with the dispersion as its last column, if it was measured.
@@ -324,15 +308,14 @@ impl Model {
 
 impl Prediction {
     /// Between two kinds of hold: `self` with share 0, `to` with 1. The derivative by the share comes after those by magnets.
-    fn towards(&self, to: &Self, share: f64) -> Self {
+    fn towards(self, to: Self, share: f64) -> Self {
         let between = |from: &DMatrix<f64>, to: &DMatrix<f64>| from * (1.0 - share) + to * share;
         let both = |from: &[DMatrix<f64>; 2], to: &[DMatrix<f64>; 2]| [0, 1].map(|i| between(&from[i], &to[i]));
-        let by_magnets = self.by_machine.iter().zip(&to.by_machine).map(|(from, to)| between(from, to));
         Self {
             matrix: between(&self.matrix, &to.matrix),
-            by_machine: by_magnets.chain([&to.matrix - &self.matrix]).collect(),
             by_monitor: both(&self.by_monitor, &to.by_monitor),
             by_corrector: both(&self.by_corrector, &to.by_corrector),
+            by_machine: self.by_machine.towards(to.by_machine, share, &to.matrix - &self.matrix),
         }
     }
 }
@@ -351,6 +334,13 @@ mod tests {
     use crate::normal::Places;
     use crate::testing::{machine, ring, ring_with_winding};
 
+    /// The derivative of the whole matrix by one unknown of the machine.
+    fn by_one(at: &Prediction, unknown: usize) -> DMatrix<f64> {
+        let columns: Vec<_> =
+            (0..at.matrix.ncols()).map(|j| at.by_machine.column(j).column(unknown).into_owned()).collect();
+        DMatrix::from_columns(&columns)
+    }
+
     /// A gradient spread over a short quadrupole changes what a thin one in its middle does.
     #[test]
     fn thin_gradients_are_those_of_short_magnets() {
@@ -361,13 +351,14 @@ mod tests {
         let (_, unknowns, values) = machine(&folder, 4);
         let model =
             Model::of(&folder, &[groups[0].clone(), groups[1].clone(), each, Vec::new()], Rf::FixedFrequency).unwrap();
-        let by_machine = model.predict(&unknowns, &values).unwrap().by_machine;
-        let thin = &by_machine[groups[0].len() + groups[1].len()..];
-        for ((thin, thick), row) in thin.iter().zip(&by_machine).zip(rows) {
+        let at = model.predict(&unknowns, &values).unwrap();
+        let first = groups[0].len() + groups[1].len();
+        for (number, row) in rows.into_iter().enumerate() {
+            let [thick, thin] = [number, first + number].map(|unknown| by_one(&at, unknown));
             let magnet = &folder.lattice[row];
             let spread = thick / (magnet.k1 * magnet.length);
             // the focusing angle of a quadrupole is 0.6: second order of its half, 0.3^2/3
-            assert!((&spread - thin).norm() < 0.06 * thin.norm(), "{row}: {}", (&spread - thin).norm() / thin.norm());
+            assert!((&spread - &thin).norm() < 0.06 * thin.norm(), "{row}: {}", (&spread - &thin).norm() / thin.norm());
         }
     }
 
@@ -407,10 +398,10 @@ mod tests {
             let numeric = (moved(step) - moved(-step)) / (2.0 * step);
             let mut unit = DVector::zeros(unknowns.len());
             unit[unknown] = 1.0;
+            let of_machine = (unknown < at.by_machine.count()).then(|| by_one(&at, unknown));
             let exact = DMatrix::from_fn(numeric.nrows(), numeric.ncols(), |i, j| {
-                let of_machine: f64 =
-                    at.by_machine.iter().zip(unit.iter()).map(|(slope, one)| slope[(i, j)] * one).sum();
-                of_machine + places.instruments(&at, i, j).map(|(one, by)| by * unit[one]).sum::<f64>()
+                of_machine.as_ref().map_or(0.0, |of_machine| of_machine[(i, j)])
+                    + places.instruments(&at, i, j).map(|(one, by)| by * unit[one]).sum::<f64>()
             });
             // the differences err by the third derivative times step^2, and by rounding
             assert!((&numeric - &exact).amax() < 1e-6 * (1.0 + exact.amax()), "{:?}", unknowns[unknown].kind);

@@ -2,9 +2,12 @@
 //!
 //! An element of the matrix depends on all of the machine, and on the two instruments of its row and its column.
 
+use core::ops::AddAssign;
+
 use nalgebra::{DMatrix, DVector};
 
 use crate::error::MeasuredError;
+use crate::linear::{add_square, in_lanes, inverse, product};
 use crate::model::Prediction;
 use crate::unknowns::{Kind, Unknown};
 
@@ -47,6 +50,16 @@ impl Places {
         places
     }
 
+    /// Unknowns of each monitor or of each corrector, of those that have more: no element depends on two of these sets.
+    pub fn apart(&self) -> Vec<Vec<usize>> {
+        let sets = |lines: &[[Option<usize>; 2]]| {
+            let each = lines.iter().map(|line| line.iter().flatten().copied().collect::<Vec<usize>>());
+            each.filter(|set| !set.is_empty()).collect::<Vec<_>>()
+        };
+        let [rows, columns] = [sets(&self.rows), sets(&self.columns)];
+        if rows.iter().flatten().count() > columns.iter().flatten().count() { rows } else { columns }
+    }
+
     /// Unknowns of the instruments that an element depends on, and its derivatives by them.
     pub fn instruments<'p>(
         &'p self,
@@ -62,9 +75,11 @@ impl Places {
     /// `J^T` of weighted elements.
     pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>, unknowns: usize) -> DVector<f64> {
         let mut back = DVector::zeros(unknowns);
-        for (into, slope) in back.iter_mut().zip(&at.by_machine) {
-            *into = slope.dot(weighted);
-        }
+        let of_machine = in_lanes(&every(weighted.ncols()), |columns| {
+            let said = |&column: &usize| at.by_machine.column(column).tr_mul(&weighted.column(column));
+            columns.iter().map(said).fold(DVector::zeros(self.machine), |sum, one| sum + one)
+        });
+        of_machine.iter().for_each(|one| back.rows_mut(0, self.machine).add_assign(one));
         for column in 0..weighted.ncols() {
             for row in (0..weighted.nrows()).filter(|&row| weighted[(row, column)] != 0.0) {
                 for (one, by) in self.instruments(at, row, column) {
@@ -77,43 +92,69 @@ impl Places {
 
     /// `J` times a step of the unknowns.
     pub fn forward(&self, at: &Prediction, step: &DVector<f64>) -> DMatrix<f64> {
-        let (rows, columns) = at.matrix.shape();
-        let mut sum = DMatrix::from_fn(rows, columns, |row, column| {
-            self.instruments(at, row, column).map(|(one, by)| by * step[one]).sum()
+        let of_machine = step.rows(0, self.machine);
+        let lanes = in_lanes(&every(at.matrix.ncols()), |columns| {
+            let moved = |&column: &usize| {
+                let mut sum = at.by_machine.column(column) * of_machine;
+                for (row, sum) in sum.iter_mut().enumerate() {
+                    *sum += self.instruments(at, row, column).map(|(one, by)| by * step[one]).sum::<f64>();
+                }
+                sum
+            };
+            columns.iter().map(moved).collect::<Vec<_>>()
         });
-        for (by, &step) in at.by_machine.iter().zip(step.iter()) {
-            sum.zip_apply(by, |sum, by| *sum += by * step);
-        }
-        sum
+        DMatrix::from_columns(&lanes.concat())
     }
 
     /// `J C J^T` of each element by itself: the variance that a covariance of the unknowns gives it.
     pub fn variance(&self, at: &Prediction, covariance: &DMatrix<f64>) -> DMatrix<f64> {
-        let (rows, columns) = at.matrix.shape();
-        let of_machine = covariance.view((0, 0), (self.machine, self.machine));
-        let mut variance = DMatrix::zeros(rows, columns);
-        let every: Vec<usize> = (0..rows).collect();
-        for column in 0..columns {
-            let by_machine = by_machine(at, &every, column);
-            let spread = &by_machine * of_machine;
-            for row in 0..rows {
-                let by = by_machine.row(row);
-                let mut sum = spread.row(row).dot(&by);
-                for (one, by_one) in self.instruments(at, row, column) {
-                    sum += 2.0 * by_one * by.tr_dot(&covariance.view((0, one), (self.machine, 1)));
-                    let others = self.instruments(at, row, column);
-                    sum += by_one * others.map(|(other, by)| by * covariance[(one, other)]).sum::<f64>();
-                }
-                variance[(row, column)] = sum;
+        let of_machine = covariance.view((0, 0), (self.machine, self.machine)).into_owned();
+        let lanes = in_lanes(&every(at.matrix.ncols()), |columns| {
+            columns
+                .iter()
+                .map(|&column| self.variance_of_column(at, column, (covariance, &of_machine)))
+                .collect::<Vec<_>>()
+        });
+        DMatrix::from_columns(&lanes.concat())
+    }
+
+    fn variance_of_column(
+        &self,
+        at: &Prediction,
+        column: usize,
+        (covariance, of_machine): (&DMatrix<f64>, &DMatrix<f64>),
+    ) -> DVector<f64> {
+        let by_machine = at.by_machine.column(column);
+        let mut spread = product(&by_machine, of_machine);
+        let mut variance = DVector::zeros(by_machine.nrows());
+        let each: Vec<Vec<_>> =
+            (0..by_machine.nrows()).map(|row| self.instruments(at, row, column).collect()).collect();
+        for (row, instruments) in each.iter().enumerate() {
+            for &(one, by_one) in instruments {
+                variance[row] +=
+                    by_one * instruments.iter().map(|&(other, by)| by * covariance[(one, other)]).sum::<f64>();
             }
         }
-        variance
+        for (unknown, mut spread) in spread.column_iter_mut().enumerate() {
+            let across = covariance.column(unknown);
+            for (spread, instruments) in spread.iter_mut().zip(&each) {
+                *spread += 2.0 * instruments.iter().map(|&(one, by)| by * across[one]).sum::<f64>();
+            }
+        }
+        variance + spread.component_mul(&by_machine).column_sum()
     }
 }
 
-/// Derivatives of some of a column's elements by the machine's unknowns, rows elements.
-fn by_machine(at: &Prediction, rows: &[usize], column: usize) -> DMatrix<f64> {
-    DMatrix::from_fn(rows.len(), at.by_machine.len(), |row, unknown| at.by_machine[unknown][(rows[row], column)])
+fn every(count: usize) -> Vec<usize> {
+    (0..count).collect()
+}
+
+/// What some columns say of the machine.
+struct OfMachine {
+    /// Columns of `J^T W J` of the machine's unknowns, of their own block the lower triangle.
+    left: DMatrix<f64>,
+    /// `J^T W r` of these.
+    slope: DVector<f64>,
 }
 
 impl Normal {
@@ -126,89 +167,122 @@ impl Normal {
         unknowns: usize,
     ) -> Self {
         let (rows, columns) = residual.shape();
-        let every = [(0..rows).collect(), (0..columns).collect()];
-        Self::of_part(places, at, (residual, weight), &every, unknowns)
+        Self::of_part(places, at, (residual, weight), &[every(rows), every(columns)], unknowns)
     }
 
     /// The same of some rows and columns alone.
     pub fn of_part(
         places: &Places,
         at: &Prediction,
-        (residual, weight): (&DMatrix<f64>, &DMatrix<f64>),
+        data: (&DMatrix<f64>, &DMatrix<f64>),
         [rows, columns]: &[Vec<usize>; 2],
         unknowns: usize,
     ) -> Self {
-        let machine = places.machine;
+        let lanes = in_lanes(columns, |columns| OfMachine::of_columns(places, at, data, (rows, columns), unknowns));
         let mut normal =
             Self { matrix: DMatrix::zeros(unknowns, unknowns), slope: DVector::zeros(unknowns), chi2: 0.0 };
-        for &column in columns {
-            let by_machine = by_machine(at, rows, column);
-            let mut weighted = by_machine.clone();
-            weighted.row_iter_mut().zip(rows).for_each(|(mut one, &row)| one *= weight[(row, column)]);
-            let weighted = weighted.transpose();
-            let mut block = normal.matrix.view_mut((0, 0), (machine, machine));
-            block.gemm(1.0, &weighted, &by_machine, 1.0);
-            let mut slope = normal.slope.rows_mut(0, machine);
-            slope.gemv(1.0, &weighted, &residual.column(column).select_rows(rows), 1.0);
-            for (counted, &row) in rows.iter().enumerate().filter(|&(_, &row)| weight[(row, column)] > 0.0) {
-                let (w, r) = (weight[(row, column)], residual[(row, column)]);
-                normal.chi2 += w * r * r;
-                for (one, by) in places.instruments(at, row, column) {
-                    normal.slope[one] += w * by * r;
-                    let mut across = normal.matrix.column_mut(one);
-                    across.rows_mut(0, machine).axpy(by, &weighted.column(counted), 1.0);
-                    for (other, by_other) in places.instruments(at, row, column) {
-                        normal.matrix[(one, other)] += w * by * by_other;
-                    }
+        for lane in lanes {
+            normal.matrix.columns_mut(0, places.machine).add_assign(&lane.left);
+            normal.slope.rows_mut(0, places.machine).add_assign(&lane.slope);
+        }
+        normal.matrix.fill_upper_triangle_with_lower_triangle();
+        normal.add_instruments(places, at, data, (rows, columns));
+        normal
+    }
+
+    /// Add what the elements say of the instruments alone.
+    fn add_instruments(
+        &mut self,
+        places: &Places,
+        at: &Prediction,
+        (residual, weight): (&DMatrix<f64>, &DMatrix<f64>),
+        (rows, columns): (&[usize], &[usize]),
+    ) {
+        let mut each = Vec::new();
+        for (row, column) in columns.iter().flat_map(|&column| rows.iter().map(move |&row| (row, column))) {
+            let (w, r) = (weight[(row, column)], residual[(row, column)]);
+            if w <= 0.0 {
+                continue;
+            }
+            self.chi2 += w * r * r;
+            each.clear();
+            each.extend(places.instruments(at, row, column));
+            for &(one, by) in &each {
+                self.slope[one] += w * by * r;
+                each.iter().for_each(|&(other, by_other)| self.matrix[(one, other)] += w * by * by_other);
+            }
+        }
+    }
+}
+
+/// Elements whose derivatives are multiplied at once: fewer leave the processor waiting for memory.
+const DEEP: usize = 512;
+
+impl OfMachine {
+    fn of_columns(
+        places: &Places,
+        at: &Prediction,
+        data: (&DMatrix<f64>, &DMatrix<f64>),
+        (rows, columns): (&[usize], &[usize]),
+        unknowns: usize,
+    ) -> Self {
+        let machine = places.machine;
+        let mut sum = Self { left: DMatrix::zeros(unknowns, machine), slope: DVector::zeros(machine) };
+        let mut of_monitors = [0, 1].map(|_| DMatrix::zeros(at.matrix.nrows(), machine));
+        for columns in columns.chunks(DEEP.div_ceil(rows.len())) {
+            let depth = rows.len() * columns.len();
+            let mut deep = DMatrix::zeros(depth, machine);
+            for (number, &column) in columns.iter().enumerate() {
+                let by_machine = at.by_machine.column(column);
+                let mut weights = DVector::zeros(by_machine.nrows());
+                rows.iter().for_each(|&row| weights[row] = data.1[(row, column)]);
+                sum.add_column(places, at, (data.0, &weights), column, &by_machine);
+                for (sum, by_monitor) in of_monitors.iter_mut().zip(&at.by_monitor) {
+                    add_times(&by_machine, &weights.component_mul(&by_monitor.column(column)), sum);
+                }
+                let roots: Vec<(usize, f64)> = rows.iter().map(|&row| (row, weights[row].sqrt())).collect();
+                let lines = deep.as_mut_slice().chunks_exact_mut(depth);
+                for (line, by) in lines.zip(by_machine.as_slice().chunks_exact(by_machine.nrows())) {
+                    let line = &mut line[number * rows.len()..];
+                    line.iter_mut().zip(&roots).for_each(|(into, &(row, root))| *into = by[row] * root);
+                }
+            }
+            add_square(&deep, &mut sum.left);
+        }
+        for (which, of_monitors) in of_monitors.iter().enumerate() {
+            for (row, said) in of_monitors.row_iter().enumerate() {
+                if let Some(place) = places.rows[row][which] {
+                    sum.left.set_row(place, &said);
                 }
             }
         }
-        for one in machine..unknowns {
-            for of_machine in 0..machine {
-                normal.matrix[(one, of_machine)] = normal.matrix[(of_machine, one)];
-            }
+        sum
+    }
+
+    /// Slopes, and what stands between machine and correctors.
+    fn add_column(
+        &mut self,
+        places: &Places,
+        at: &Prediction,
+        (residual, weights): (&DMatrix<f64>, &DVector<f64>),
+        column: usize,
+        by_machine: &DMatrix<f64>,
+    ) {
+        self.slope.gemv_tr(1.0, by_machine, &weights.component_mul(&residual.column(column)), 1.0);
+        for (place, by) in places.columns[column].iter().zip(&at.by_corrector) {
+            let Some(place) = *place else { continue };
+            let said = by_machine.tr_mul(&weights.component_mul(&by.column(column)));
+            self.left.row_mut(place).add_assign(&said.transpose());
         }
-        normal
     }
 }
 
-/// Below this size a matrix is inverted by its Cholesky factor.
-const SMALL: usize = 64;
-
-/// Inverse of a symmetric positive matrix, `None` where it is not one: by halves, so that nearly all of it is products of matrices, which are ten times
-/// as fast as substitutions.
-///
-/// With `S = D - B^T A^-1 B`, the Schur complement, and `X = A^-1 B`
-///
-/// `(A B; B^T D)^-1 = (A^-1 + X S^-1 X^T, -X S^-1; -S^-1 X^T, S^-1)`.
-///
-/// Halves are cut from a matrix with ones on its diagonal; where rounding leaves one of them no longer positive, the whole matrix is inverted by its factor.
-pub fn inverse(matrix: &DMatrix<f64>) -> Option<DMatrix<f64>> {
-    let scale = matrix.diagonal().map(|one| one.sqrt().recip());
-    match by_halves(&times(matrix.clone(), &scale)) {
-        Some(inverse) => Some(times(inverse, &scale)),
-        None => Some(matrix.clone().cholesky()?.inverse()),
+/// Add the columns of a matrix, each row times its weight.
+fn add_times(matrix: &DMatrix<f64>, weights: &DVector<f64>, sum: &mut DMatrix<f64>) {
+    let columns = matrix.as_slice().chunks_exact(weights.len());
+    for (sum, column) in sum.as_mut_slice().chunks_exact_mut(weights.len()).zip(columns) {
+        sum.iter_mut().zip(column).zip(weights.as_slice()).for_each(|((sum, one), weight)| *sum += one * weight);
     }
-}
-
-fn by_halves(matrix: &DMatrix<f64>) -> Option<DMatrix<f64>> {
-    let n = matrix.nrows();
-    if n <= SMALL {
-        return Some(matrix.clone().cholesky()?.inverse());
-    }
-    let half = n / 2;
-    let rest = n - half;
-    let first = by_halves(&matrix.view((0, 0), (half, half)).into_owned())?;
-    let across = matrix.view((0, half), (half, rest));
-    let follow = &first * across;
-    let schur = by_halves(&(matrix.view((half, half), (rest, rest)) - across.tr_mul(&follow)))?;
-    let off = &follow * &schur;
-    let mut inverse = DMatrix::zeros(n, n);
-    inverse.view_mut((0, 0), (half, half)).copy_from(&(first + &off * follow.transpose()));
-    inverse.view_mut((0, half), (half, rest)).copy_from(&-&off);
-    inverse.view_mut((half, 0), (rest, half)).copy_from(&-off.transpose());
-    inverse.view_mut((half, half), (rest, rest)).copy_from(&schur);
-    Some(inverse)
 }
 
 /// An information matrix in units of the priors' widths, with the priors.
@@ -231,22 +305,4 @@ pub fn covariance(unknowns: &[Unknown], information: DMatrix<f64>) -> Result<DMa
     let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
     let inverse = inverse(&in_widths(information, &width)).ok_or(MeasuredError::Singular(0))?;
     Ok(times(inverse, &width))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::testing::normal;
-
-    #[test]
-    fn an_inverse_by_halves_is_the_inverse() {
-        let mut random = normal(1);
-        for n in [3, SMALL, SMALL + 1, 3 * SMALL + 5] {
-            let root = DMatrix::from_fn(n, n, |_, _| random());
-            let matrix = &root * root.transpose() + DMatrix::identity(n, n);
-            let found = inverse(&matrix).unwrap();
-            assert!((found * &matrix - DMatrix::identity(n, n)).amax() < 1e-9, "{n}: rounding, condition 1000");
-            assert_eq!(inverse(&(DMatrix::identity(n, n) * -1.0)), None);
-        }
-    }
 }

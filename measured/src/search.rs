@@ -21,6 +21,7 @@ use statrs::distribution::{Continuous, StudentsT};
 use crate::error::MeasuredError;
 use crate::family::{BEFOREHAND, FREE, Family};
 use crate::hierarchy::{Hierarchy, Posterior};
+use crate::linear::product;
 use crate::unknowns::{Kind, Unknown};
 
 /// Members that are released in one search at most.
@@ -236,7 +237,7 @@ impl Members {
             }
         }
         let slope = &precision * &equal.values;
-        let curvature = &precision - &precision * &equal.covariance * &precision;
+        let curvature = &precision - product(&product(&precision, &equal.covariance), &precision);
         let prior = |&unknown: &usize| {
             let kind = all[unknown].kind;
             let alike = unknowns.iter().filter(|&&other: &&usize| all[other].kind.word() == kind.word()).count();

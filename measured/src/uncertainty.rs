@@ -16,6 +16,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
+use crate::linear::{product, transposed_product};
 use crate::model::Prediction;
 use crate::noise::Noise;
 use crate::normal::{Normal, Places, covariance};
@@ -34,6 +35,8 @@ pub struct Uncertainty {
     alone: DMatrix<f64>,
     /// `J^T W J` of independent errors of the learnt size.
     information: DMatrix<f64>,
+    /// Of the variance of each unknown with independent errors, what they make: the rest is of the prior.
+    of_data: DVector<f64>,
 }
 
 impl Uncertainty {
@@ -61,21 +64,24 @@ impl Uncertainty {
         let nothing = DMatrix::zeros(slope.nrows(), slope.ncols());
         let together = together(places, at, &slope, n);
         let alone = Normal::of(places, at, &nothing, &slope.component_mul(&slope), n).matrix;
-        let mut all = Self { independent, sigma: DVector::zeros(n), together, alone, information };
-        let of_lines = all.together.tr_mul(&all.independent);
-        let [of_elements, of_data] = [&all.alone, &all.information].map(|matrix| matrix * &all.independent);
+        let [sigma, of_data] = [DVector::zeros(n), DVector::zeros(n)];
+        let mut all = Self { independent, sigma, together, alone, information, of_data };
+        let of_lines = transposed_product(&all.together, &all.independent);
+        let diagonal = |matrix: &DMatrix<f64>, independent: &DMatrix<f64>| {
+            product(matrix, independent).component_mul(independent).row_sum().transpose()
+        };
+        let of_elements = diagonal(&all.alone, &all.independent);
+        all.of_data = diagonal(&all.information, &all.independent);
         all.sigma = DVector::from_fn(n, |i, _| {
-            let direction = all.independent.column(i);
-            let [elements, data] = [&of_elements, &of_data].map(|matrix| direction.dot(&matrix.column(i)));
-            variance(of_lines.column(i).norm_squared(), elements, data, all.independent[(i, i)]).sqrt()
+            let independent = all.independent[(i, i)];
+            variance(of_lines.column(i).norm_squared(), of_elements[i], all.of_data[i], independent).sqrt()
         });
         all
     }
 
     /// How many times larger the variance that the data leave an unknown is than that of independent errors.
     pub fn widening(&self, unknown: usize) -> f64 {
-        let direction = self.independent.column(unknown);
-        let of_data = direction.dot(&(&self.information * direction));
+        let of_data = self.of_data[unknown];
         let of_prior = self.independent[(unknown, unknown)] - of_data;
         if of_data > 0.0 { ((self.sigma[unknown].powi(2) - of_prior) / of_data).max(1.0) } else { 1.0 }
     }
@@ -127,10 +133,14 @@ fn variance(lines: f64, elements: f64, of_data: f64, independent: f64) -> f64 {
 fn together(places: &Places, at: &Prediction, slope: &DMatrix<f64>, unknowns: usize) -> DMatrix<f64> {
     let (rows, columns) = slope.shape();
     let mut together = DMatrix::zeros(unknowns, rows + columns);
-    for (unknown, by) in at.by_machine.iter().enumerate() {
-        let said = by.component_mul(slope);
-        said.row_iter().enumerate().for_each(|(row, one)| together[(unknown, row)] = one.sum());
-        said.column_iter().enumerate().for_each(|(column, one)| together[(unknown, rows + column)] = one.sum());
+    for column in 0..columns {
+        let mut said = at.by_machine.column(column);
+        for (unknown, mut said) in said.column_iter_mut().enumerate() {
+            said.component_mul_assign(&slope.column(column));
+            together[(unknown, rows + column)] = said.sum();
+        }
+        let mut of_rows = together.view_mut((0, 0), (said.ncols(), rows));
+        of_rows += said.transpose();
     }
     for (row, column) in (0..columns).flat_map(|column| (0..rows).map(move |row| (row, column))) {
         for (unknown, by) in places.instruments(at, row, column) {

@@ -47,6 +47,23 @@ impl Kind {
         }
     }
 
+    /// True of what the machine has, false of the instruments.
+    pub fn is_of_machine(self) -> bool {
+        match self {
+            Self::Strength(_)
+            | Self::Added(_)
+            | Self::Skew(_)
+            | Self::Gradient(_)
+            | Self::Wiggler(_)
+            | Self::HeldFrequency => true,
+            Self::MonitorGain(_)
+            | Self::MonitorCoupling(_)
+            | Self::CorrectorGain(_)
+            | Self::CorrectorCoupling(_)
+            | Self::RfScale => false,
+        }
+    }
+
     /// Gradient of a magnet [1/m^2] whose own is `k1`, at a value of the unknown that it is of.
     pub fn gradient(self, k1: f64, value: f64) -> f64 {
         if matches!(self, Self::Added(_)) { k1 + value } else { k1 * value }

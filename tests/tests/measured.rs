@@ -299,10 +299,9 @@ fn of_instrument(folder: &Folder, fitted: &Fit, at: &Prediction, side: Side, one
         Side::Monitors => &at.by_monitor,
         Side::Correctors => &at.by_corrector,
     };
-    let machine = at.by_machine.len();
     let scale = |&(i, j): &(usize, usize)| {
-        let by_machine = |k: usize| if k < machine { at.by_machine[k][(i, j)] } else { 0.0 };
-        let of_magnets = fitted.uncertainty.variance(&DVector::from_fn(fitted.values.len(), |k, _| by_machine(k)));
+        let by_machine = at.by_machine.column(j).row(i).transpose();
+        let of_magnets = fitted.uncertainty.variance(&by_machine.resize_vertically(fitted.values.len(), 0.0));
         let missed = fitted.noise.blocks[fitted.data.block[(i, j)]];
         ((fitted.noise.monitors[i] * missed.spread(folder.monitors[i].sigma)).hypot(of_magnets.sqrt()), missed.freedom)
     };

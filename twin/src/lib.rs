@@ -14,6 +14,7 @@
 mod calibrated;
 mod dispersion;
 mod effects;
+mod factors;
 mod lattice;
 pub mod limits;
 mod map;
@@ -36,6 +37,7 @@ pub use effects::{
     HoldEffect, Holding, Machine, MachineResponse, Measured, Mechanism, MonitorEffect, Rf, Signature, Signatures, Thin,
     Tracked, Unit, change_at,
 };
+pub use factors::ResponseFactors;
 pub use lattice::{
     Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, Parameter, ParameterPrior, Particle, Plane,
     Quadrupole, RampPoint, Ring, Supply, unreadable,

@@ -96,7 +96,7 @@ impl Gradient {
     }
 
     /// What a winding of the same element sends into it, beside its closed orbit; none of other sources.
-    fn within(&self, source: &Source) -> Option<Vector6<f64>> {
+    pub(crate) fn within(&self, source: &Source) -> Option<Vector6<f64>> {
         let (shares, acted) = self.shares.zip(source.acted).filter(|_| source.place == self.place)?;
         Some(shares.iter().zip(&acted).map(|(share, acted)| share * acted).sum())
     }
@@ -108,7 +108,7 @@ pub struct Optics<'r> {
     pub(crate) ring: &'r Ring,
     pub(crate) orbit: ClosedOrbit,
     /// Closed orbit at the start for a source, `W`.
-    closed: Matrix6<f64>,
+    pub(crate) closed: Matrix6<f64>,
     /// The same with the momentum held.
     pub(crate) closed_at_momentum: Matrix6<f64>,
     /// Closed orbit at the start for a unit of momentum deviation.

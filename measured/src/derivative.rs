@@ -1,0 +1,126 @@
+//! The derivative of a matrix by the machine's unknowns, made column by column: the whole of it is never stored.
+
+use std::collections::BTreeMap;
+
+use nalgebra::DMatrix;
+use twin::{Gradient, Observer, Optics, ResponseFactors, Source};
+
+/// What changes in an element.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Change {
+    /// Its gradient.
+    Normal,
+    /// Its skew gradient.
+    Skew,
+    /// Its vertical focusing, as of a wiggler.
+    Vertical,
+}
+
+/// A number of an element that an unknown changes, and by how much a unit of the unknown.
+pub type Share = (usize, Change, f64);
+
+/// The derivative by gradients that change together, one group an unknown, then by the share of a held RF frequency if that is one.
+#[derive(Debug, Clone)]
+pub struct ByMachine {
+    rows: usize,
+    /// Pieces of the corrector of each column.
+    pieces: Vec<Vec<usize>>,
+    /// Numbers that the unknowns change, with their shares of each.
+    groups: Vec<Vec<(usize, f64)>>,
+    /// Of each kind of hold, and what it counts.
+    holds: Vec<(f64, OfHold)>,
+    by_share: Option<DMatrix<f64>>,
+}
+
+/// Derivatives by every number that changes.
+#[derive(Debug, Clone)]
+struct OfHold {
+    factors: ResponseFactors,
+    /// Of the last column, if the dispersion was measured.
+    dispersion: Option<DMatrix<f64>>,
+}
+
+impl ByMachine {
+    /// About one closed orbit: what each unknown changes; what is seen and what kicks, the sources being the pieces of the correctors in order, so many of
+    /// each; the change of the RF frequency [mm per unit] if the dispersion is the last column.
+    pub fn about(
+        optics: &Optics,
+        unknowns: &[Vec<Share>],
+        (observers, sources): (&[Observer], &[Source]),
+        pieces: impl Iterator<Item = usize>,
+        rf: Option<f64>,
+    ) -> Self {
+        let mut changes = BTreeMap::new();
+        unknowns.iter().flatten().for_each(|&(element, change, _)| _ = changes.insert((element, change), 0));
+        changes.values_mut().enumerate().for_each(|(number, at)| *at = number);
+        let gradients: Vec<Gradient> =
+            changes.keys().map(|&(element, change)| gradient(optics, element, change)).collect();
+        let group = |group: &Vec<Share>| {
+            group.iter().map(|&(element, change, share)| (changes[&(element, change)], share)).collect()
+        };
+        let mut next = 0;
+        let pieces = pieces.map(|count| {
+            next += count;
+            (next - count..next).collect()
+        });
+        let dispersion = rf.map(|rf| optics.rf_jacobian(observers, &gradients) * rf);
+        Self {
+            rows: observers.len(),
+            pieces: pieces.collect(),
+            groups: unknowns.iter().map(group).collect(),
+            holds: vec![(1.0, OfHold { factors: optics.response_factors(observers, sources, gradients), dispersion })],
+            by_share: None,
+        }
+    }
+
+    /// Between two kinds of hold, with the derivative by the share of the second one.
+    pub fn towards(self, to: Self, share: f64, by_share: DMatrix<f64>) -> Self {
+        let from = self.holds.into_iter().map(|(counts, hold)| (counts * (1.0 - share), hold));
+        let to = to.holds.into_iter().map(|(counts, hold)| (counts * share, hold));
+        Self { holds: from.chain(to).collect(), by_share: Some(by_share), ..self }
+    }
+
+    /// Unknowns.
+    pub fn count(&self) -> usize {
+        self.groups.len() + usize::from(self.by_share.is_some())
+    }
+
+    /// Derivatives of the elements of a column, rows elements.
+    pub fn column(&self, column: usize) -> DMatrix<f64> {
+        let changes = self.of_changes(column);
+        let mut made = DMatrix::zeros(self.rows, self.count());
+        for (mut into, group) in made.column_iter_mut().zip(&self.groups) {
+            group.iter().for_each(|&(number, share)| into.axpy(share, &changes.column(number), 1.0));
+        }
+        if let Some(by_share) = &self.by_share {
+            made.set_column(self.groups.len(), &by_share.column(column));
+        }
+        made
+    }
+
+    /// The same by every number that changes.
+    fn of_changes(&self, column: usize) -> DMatrix<f64> {
+        let of_hold = |(counts, hold): &(f64, OfHold)| hold.column(self.pieces.get(column), self.rows) * *counts;
+        self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something")
+    }
+}
+
+impl OfHold {
+    /// The column of a corrector's pieces, or the last one.
+    fn column(&self, pieces: Option<&Vec<usize>>, rows: usize) -> DMatrix<f64> {
+        let Some(pieces) = pieces else { return self.dispersion.clone().expect("the last column was measured") };
+        let mut made = DMatrix::zeros(rows, self.factors.count());
+        for (gradient, mut into) in made.column_iter_mut().enumerate() {
+            pieces.iter().for_each(|&piece| self.factors.add(piece, gradient, into.as_mut_slice()));
+        }
+        made
+    }
+}
+
+fn gradient(optics: &Optics, element: usize, change: Change) -> Gradient {
+    match change {
+        Change::Normal => optics.gradient(element),
+        Change::Skew => optics.skew_gradient(element),
+        Change::Vertical => optics.vertical_focusing(element),
+    }
+}
