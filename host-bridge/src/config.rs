@@ -370,13 +370,14 @@ impl Config {
     }
 
     fn parse(text: &str) -> Result<Self, Vec<Problem>> {
+        let lines = Lines::new(text);
         let (table, errors) = DeTable::parse_recoverable(text);
-        let mut problems: Vec<Problem> = errors.iter().map(|error| of_toml(text, error)).collect();
+        let mut problems: Vec<Problem> = errors.iter().map(|error| of_toml(&lines, error)).collect();
         if problems.is_empty() {
-            problems = keys::check(text, table.get_ref());
+            problems = keys::check(&lines, table.get_ref());
         }
         if problems.is_empty() {
-            let config: Self = toml::from_str(text).map_err(|error| vec![of_toml(text, &error)])?;
+            let config: Self = toml::from_str(text).map_err(|error| vec![of_toml(&lines, &error)])?;
             return config.expect_no_circle();
         }
         problems.sort();
@@ -397,13 +398,25 @@ impl Config {
     }
 }
 
-fn of_toml(text: &str, error: &toml::de::Error) -> Problem {
-    Problem { line: error.span().map_or(0, |span| line(text, span.start)), what: error.message().to_owned() }
+fn of_toml(lines: &Lines<'_>, error: &toml::de::Error) -> Problem {
+    Problem { line: error.span().map_or(0, |span| lines.line(span.start)), what: error.message().to_owned() }
 }
 
-/// Line of a byte of a text, counted from 1.
-fn line(text: &str, at: usize) -> usize {
-    1 + text.bytes().take(at).filter(|byte| *byte == b'\n').count()
+/// A text and where its lines end: a file may have as many problems as bytes, and none of them counts the lines anew.
+struct Lines<'t> {
+    text: &'t str,
+    ends: Vec<usize>,
+}
+
+impl<'t> Lines<'t> {
+    fn new(text: &'t str) -> Self {
+        Self { text, ends: text.match_indices('\n').map(|(at, _)| at).collect() }
+    }
+
+    /// Line of a byte, counted from 1.
+    fn line(&self, at: usize) -> usize {
+        1 + self.ends.partition_point(|end| *end < at)
+    }
 }
 
 impl From<ConfigError> for CommandError {
@@ -462,6 +475,15 @@ mod tests {
         assert!(problems[0].starts_with("2: "), "{problems:?}");
         assert_eq!(said("machine = 3\n[source]\n")[2], "1: machine = 3: expected a section");
         assert_eq!(said("").len(), 2);
+    }
+
+    /// A text of the most bytes, all of it wrong: 80,000 problems, each with its line.
+    #[test]
+    fn problems_without_number_are_said_with_their_lines() {
+        let text = "[machine]\n".to_owned() + &"a = 1\na = 2\n".repeat(80_000);
+        let problems = said(&text);
+        assert!(problems.len() >= 80_000);
+        assert_eq!(problems.last().unwrap(), "160001: duplicate key");
     }
 
     #[test]

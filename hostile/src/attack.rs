@@ -1,7 +1,8 @@
 //! One input of one target.
 
+use core::panic::AssertUnwindSafe;
 use core::time::Duration;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::panic::catch_unwind;
 use std::time::Instant;
 
 use crate::{ALLOCATOR, Target};

@@ -5,7 +5,7 @@ use core::net::SocketAddr;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::{Problem, line};
+use super::{Lines, Problem};
 use crate::source::origin::Origin;
 
 /// A key.
@@ -460,20 +460,20 @@ impl Kind {
 }
 
 /// Everything that is wrong with the values of a file.
-pub fn check(text: &str, file: &DeTable<'_>) -> Vec<Problem> {
+pub(super) fn check(lines: &Lines<'_>, file: &DeTable<'_>) -> Vec<Problem> {
     let mut problems = missing(file);
     for (section, value) in file {
         let name: &str = section.get_ref();
-        let at = line(text, section.span().start);
+        let at = lines.line(section.span().start);
         let problem = |what| Problem { line: at, what };
         match value.get_ref() {
             _ if KEYS.iter().all(|key| key.section != name) => {
                 problems.push(problem(format!("{name}: no such section")))
             }
             DeValue::Table(table) => {
-                problems.extend(table.iter().filter_map(|(key, value)| wrong(text, name, key, value)))
+                problems.extend(table.iter().filter_map(|(key, value)| wrong(lines, name, key, value)))
             }
-            _ => problems.push(problem(format!("{name} = {}: expected a section", written(text, value)))),
+            _ => problems.push(problem(format!("{name} = {}: expected a section", written(lines, value)))),
         }
     }
     problems
@@ -491,17 +491,22 @@ fn missing(file: &DeTable<'_>) -> Vec<Problem> {
     absent.map(|key| Problem { line: 0, what: what(key) }).collect()
 }
 
-fn wrong(text: &str, section: &str, name: &Spanned<impl AsRef<str>>, value: &Spanned<DeValue<'_>>) -> Option<Problem> {
-    let (at, name) = (line(text, name.span().start), name.get_ref().as_ref());
+fn wrong(
+    lines: &Lines<'_>,
+    section: &str,
+    name: &Spanned<impl AsRef<str>>,
+    value: &Spanned<DeValue<'_>>,
+) -> Option<Problem> {
+    let (at, name) = (lines.line(name.span().start), name.get_ref().as_ref());
     let Some(key) = KEYS.iter().find(|key| key.section == section && key.name == name) else {
         return Some(Problem { line: at, what: format!("{section}.{name}: no such key") });
     };
     let default = key.default.map_or_else(String::new, |default| format!("; default {default}"));
-    let what = || format!("{section}.{name} = {}: expected {}{default}", written(text, value), key.range);
+    let what = || format!("{section}.{name} = {}: expected {}{default}", written(lines, value), key.range);
     (!key.kind.allows(value.get_ref())).then(|| Problem { line: at, what: what() })
 }
 
 /// A value as it is written.
-fn written<'t>(text: &'t str, value: &Spanned<DeValue<'_>>) -> &'t str {
-    text.get(value.span()).unwrap_or_default()
+fn written<'t>(lines: &Lines<'t>, value: &Spanned<DeValue<'_>>) -> &'t str {
+    lines.text.get(value.span()).unwrap_or_default()
 }

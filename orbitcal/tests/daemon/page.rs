@@ -1,6 +1,5 @@
 //! The live page and the metrics: read over loopback, shown in a browser, and no way to change anything.
 
-use core::time::Duration;
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpStream;
