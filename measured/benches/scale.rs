@@ -1,0 +1,175 @@
+//! Time and memory of fit, diagnosis and comparison against the size of a ring: a ring of cells with errors, measured with noise.
+//!
+//! `cargo bench -p measured --bench scale -- 50 100 200` prints a line a size, each in a process of its own, and the exponents of the gradients that
+//! times and memory grow with. The table of docs/large-rings.md.
+
+use core::error::Error;
+use core::f64::consts::TAU;
+use std::fs;
+use std::process::Command;
+use std::time::Instant;
+
+use measured::folder::{CorrectorRow, Folder, Meta, MonitorRow, Particle, Row};
+use measured::unknowns::{Kind, Widths, groups, unknowns};
+use measured::{Diagnosis, Model, Settings, Straightened, compare};
+use nalgebra::{DMatrix, DVector};
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+use rand_distr::{Distribution, StandardNormal};
+use twin::{Plane, Rf};
+
+/// Noise of an element of the matrix [mm].
+const NOISE: f64 = 0.002;
+/// Gradients up to which diagnosis and comparison are timed: beyond they take many minutes.
+const MOST: usize = 200;
+/// Columns: gradients, response with its instruments' derivatives, all columns of the Jacobian, fit, diagnosis, comparison [s], memory [MB].
+const NAMES: [&str; 8] =
+    ["gradients", "response/s", "jacobian/s", "fit/s", "fit/MB", "pull", "diagnose/s", "compare/s"];
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|one| one != "--bench").collect();
+    if let [one, gradients] = arguments.as_slice()
+        && one == "one"
+    {
+        println!("{}", measure(gradients.parse()?)?.map(|number| number.to_string()).join(" "));
+        return Ok(());
+    }
+    println!("{}", NAMES.map(|name| format!("{name:>11}")).concat());
+    let mut lines = Vec::new();
+    for gradients in
+        if arguments.is_empty() { ["50", "100", "200", "400"].map(String::from).to_vec() } else { arguments }
+    {
+        let output = Command::new(std::env::current_exe()?).args(["one", &gradients]).output()?;
+        let numbers = String::from_utf8(output.stdout)?;
+        let numbers: Vec<f64> = numbers.split_whitespace().map(str::parse).collect::<Result<_, _>>()?;
+        println!("{}", numbers.iter().map(|number| format!("{number:>11.3}")).collect::<String>());
+        lines.push(numbers);
+    }
+    let slopes = (1..NAMES.len()).map(|column| format!("{:>11.2}", exponent(&lines, column)));
+    println!("{:>11}{}", "exponent", slopes.collect::<String>());
+    Ok(())
+}
+
+/// Slope of `ln` of a column against `ln` of the first one, by least squares.
+fn exponent(lines: &[Vec<f64>], column: usize) -> f64 {
+    let points = lines.iter().filter_map(|line| Some([line[0].ln(), line.get(column)?.ln()])).collect::<Vec<_>>();
+    let mean = |which: usize| points.iter().map(|point| point[which]).sum::<f64>() / points.len() as f64;
+    let (x, y) = (mean(0), mean(1));
+    let across: f64 = points.iter().map(|point| (point[0] - x) * (point[1] - y)).sum();
+    across / points.iter().map(|point| (point[0] - x).powi(2)).sum::<f64>()
+}
+
+/// The numbers of one size.
+fn measure(gradients: usize) -> Result<[f64; 8], Box<dyn Error>> {
+    let ring = ring(gradients / 2);
+    let (before, truth) = measured_with_errors(&ring, 2)?;
+    let settings = Settings::default();
+    let groups = groups(&before);
+    let (model, all) =
+        (Model::of(&before, &groups, settings.rf)?, unknowns(&before, &groups, true, &Widths::default()));
+    let means = DVector::from_iterator(all.len(), all.iter().map(|one| one.mean));
+    let (response, prediction) = timed(|| model.predict(&all, &means));
+    let prediction = prediction?;
+    let columns = 0..prediction.matrix.ncols();
+    let (jacobian, _) = timed(|| columns.map(|column| prediction.by_machine.column(column).sum()).sum::<f64>());
+    let (fit, straightened) = timed(|| Straightened::of(&before, &settings, &mut |_| ()));
+    let Straightened { folder, cables, fit: fitted } = straightened?;
+    let memory = peak()?;
+    let pulls = (0..gradients).map(|at| ((fitted.values[at] - truth[at]) / fitted.sigma(at)).powi(2));
+    let pull = (pulls.sum::<f64>() / gradients as f64).sqrt();
+    let (mut diagnosis, mut comparison) = (f64::NAN, f64::NAN);
+    if gradients <= MOST {
+        let (time, found) = timed(|| Diagnosis::of_fit((&folder, &cables), &fitted, &settings, &mut |_| ()));
+        found?;
+        diagnosis = time;
+        let (after, _) = measured_with_errors(&ring, 3)?;
+        let (time, changes) = timed(|| compare(&before, &after, &settings, &mut |_| ()));
+        changes?;
+        comparison = time;
+    }
+    Ok([gradients as f64, response, jacobian, fit, memory, pull, diagnosis, comparison])
+}
+
+/// A result and how long it took [s].
+fn timed<T>(make: impl FnOnce() -> T) -> (f64, T) {
+    let start = Instant::now();
+    let made = make();
+    (start.elapsed().as_secs_f64(), made)
+}
+
+/// Most memory that this process has had [MB].
+fn peak() -> Result<f64, Box<dyn Error>> {
+    let status = fs::read_to_string("/proc/self/status")?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).ok_or("Linux states VmHWM")?;
+    Ok(line.trim().trim_end_matches(" kB").parse::<f64>()? / 1024.0)
+}
+
+/// Cells of two quadrupoles, a dipole, a monitor and a corrector, both of both planes.
+fn ring(cells: usize) -> Folder {
+    let (mut lattice, mut s) = (Vec::new(), 0.0);
+    let mut add = |name: &str, length: f64, bend: f64, k1: f64| {
+        let edge = bend / 2.0;
+        lattice.push(Row {
+            name: name.into(),
+            s,
+            length,
+            bend,
+            edge_in: edge,
+            edge_out: edge,
+            fringe: 0.0,
+            k1,
+            half_k2: 0.0,
+        });
+        s += length;
+        lattice.len() - 1
+    };
+    let (mut monitors, mut correctors) = (Vec::new(), Vec::new());
+    for cell in 0..cells {
+        let at = add("BPM", 0.0, 0.0, 0.0);
+        monitors.extend([Plane::X, Plane::Y].map(|plane| MonitorRow { plane, at, sigma: NOISE, is_used: true }));
+        add("L", 0.4, 0.0, 0.0);
+        add("QF", 0.3, 0.0, 4.0);
+        let at = add("COR", 0.2, 0.0, 0.0);
+        correctors.extend([Plane::X, Plane::Y].map(|plane| CorrectorRow { plane, at, kick: 0.2, is_used: true }));
+        add("B", 1.2, TAU / cells as f64, 0.0);
+        add("QD", 0.3, 0.0, -3.0);
+        // no symmetry: cells that are all alike have modes that errors of gradients excite together
+        add("L", 0.6 + 0.2 * f64::from(u8::from(cell % 3 != 0)), 0.0, 0.0);
+    }
+    monitors.sort_by_key(|one| one.plane.index());
+    correctors.sort_by_key(|one| one.plane.index());
+    let meta = Meta {
+        circumference: s,
+        energy: Some(6.0),
+        particle: Particle::Electron,
+        rf: 5e8,
+        delta_rf: 2e2,
+        reference_fit: None,
+    };
+    let matrix = DMatrix::zeros(monitors.len(), correctors.len());
+    let dispersion = Some(DVector::zeros(monitors.len()));
+    Folder { name: format!("{} cells", cells), meta, lattice, monitors, correctors, matrix, dispersion }
+}
+
+/// The ring measured with some noise, always with the same errors: strengths off by 0.3 %, gains by 2 % and couplings by 0.5 %, and the values of its unknowns.
+fn measured_with_errors(ring: &Folder, noise: u64) -> Result<(Folder, DVector<f64>), Box<dyn Error>> {
+    let normal = |seed: u64| {
+        let mut random = StdRng::seed_from_u64(seed);
+        move || -> f64 { StandardNormal.sample(&mut random) }
+    };
+    let (mut error, mut noise) = (normal(1), normal(noise));
+    let groups = groups(ring);
+    let all = unknowns(ring, &groups, true, &Widths::default());
+    let size = |kind: Kind| match kind {
+        Kind::Strength(_) => 0.003,
+        Kind::MonitorGain(_) | Kind::CorrectorGain(_) => 0.02,
+        Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.005,
+        _ => 0.0,
+    };
+    let truth = DVector::from_iterator(all.len(), all.iter().map(|one| one.mean + size(one.kind) * error()));
+    let seen = Model::of(ring, &groups, Rf::FixedFrequency)?.predict(&all, &truth)?.matrix;
+    let seen = seen.map(|element| element + NOISE * noise());
+    let correctors = ring.correctors.len();
+    let (matrix, dispersion) = (seen.columns(0, correctors).into_owned(), seen.column(correctors).into_owned());
+    Ok((Folder { matrix, dispersion: Some(dispersion), ..ring.clone() }, truth))
+}
