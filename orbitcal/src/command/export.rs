@@ -54,7 +54,7 @@ impl<'l> ExportResult<'l> {
             format: options.format.into(),
             machine: &lattice.machine,
             elements: lattice.elements.len(),
-            tunes: lattice.tunes.map(|[x, y]| Tunes { x, y }),
+            tunes: lattice.tunes.map(|[x, y]| Tunes { x, y, sigma: None }),
             remarks: &lattice.remarks,
         }
     }
