@@ -40,9 +40,9 @@ const ALONE: f64 = 3.0;
 pub const FREE: f64 = 10.0;
 /// The scale of an ordinary ring: strengths 0.3 %, gains 2 %, couplings 0.5 %, gradients and skew gradients 0.001 /m.
 pub const ORDINARY: f64 = 0.1;
-/// The scale of changes of a ring in which nothing was changed: strengths 0.06 %, gains 0.4 %, gradients 0.0002 /m. With it, changes of strengths between repeated
-/// measurements of a real ring have mean square pulls of 0.2 to 1.0.
-pub const UNCHANGED: f64 = 0.02;
+/// The scale of changes of a ring in which nothing was changed: strengths 0.03 %, gains 0.2 %, gradients 0.0001 /m. With it, changes of strengths between repeated
+/// measurements of a real ring have mean square pulls of 0.2 to 1.1.
+pub const UNCHANGED: f64 = 0.01;
 /// Class of the factor that all strengths have.
 pub const ALL: &str = "all";
 /// Members that the ordinary scale counts as.

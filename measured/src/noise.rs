@@ -1,11 +1,10 @@
 //! Errors of a matrix's elements: what the model misses in each block, and how far each monitor errs beside the others.
 //!
-//! An element of monitor `i` in block `b` has an error of scale `f_i s_b`, `s_b` that of its block ([`Missed`]). `f_i` is told by what the gain and the coupling of
-//! the monitor leave. Most monitors err as their block does, `f_i = 1`;
+//! An element of monitor `i` in block `b` has an error of scale `f_i s_b`, `s_b` that of its block ([`Missed`]). Most monitors err as their block does, `f_i = 1`;
 //! a monitor has a scale of its own where that gains more `ln` likelihood than one of so many monitors does by chance. Elements of a faulty monitor then
 //! count little, and do not make errors of all others look as if they had heavy tails; a stated noise that is too large is found too.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 use statrs::distribution::{ContinuousCDF, Normal};
 
 use crate::data::{BLOCKS, Data};
@@ -60,16 +59,15 @@ impl Noise {
     ) -> Self {
         let followed = places.variance(prediction, covariance).component_mul(&data.weight(self, residual));
         let errors = residual.zip_map(&followed, |left, followed| left / (1.0 - followed).max(LEAST_LEFT).sqrt());
-        let own = beside_instrument(data, prediction, &errors);
-        self.clone().with_errors(data, &errors, &own)
+        self.clone().with_errors(data, &errors)
     }
 
     /// Blocks and monitors in turn, until no monitor changes.
-    fn with_errors(mut self, data: &Data, errors: &DMatrix<f64>, own: &DMatrix<f64>) -> Self {
+    fn with_errors(mut self, data: &Data, errors: &DMatrix<f64>) -> Self {
         let chance = by_chance(self.monitors.len());
         for _ in 0..TURNS {
             self.blocks = self.blocks_with(data, errors);
-            let scales: Vec<Own> = (0..self.monitors.len()).map(|row| self.own(data, own, row, chance)).collect();
+            let scales: Vec<Own> = (0..self.monitors.len()).map(|row| self.own(data, errors, row, chance)).collect();
             let best = scales.iter().map(|own| own.gain).fold(0.0, f64::max);
             if best <= ENOUGH {
                 break;
@@ -119,28 +117,6 @@ impl Noise {
         let now = if present == 1.0 { alike } else { told(present.ln()) - chance };
         Own { scale: if own > alike { log.exp() } else { 1.0 }, gain: own.max(alike) - now }
     }
-}
-
-/// Errors without what the gain and the coupling of their own monitor would explain of them, if both were free: a monitor that reads of the other plane is no
-/// monitor of large errors.
-fn beside_instrument(data: &Data, prediction: &Prediction, errors: &DMatrix<f64>) -> DMatrix<f64> {
-    let mut own = errors.clone();
-    for row in 0..errors.nrows() {
-        let counted: Vec<usize> = (0..errors.ncols()).filter(|&column| data.sigma[(row, column)].is_finite()).collect();
-        let weight = |column: usize| data.sigma[(row, column)].recip();
-        let by = DMatrix::from_fn(counted.len(), 2, |i, of| {
-            prediction.by_monitor[of][(row, counted[i])] * weight(counted[i])
-        });
-        let error = DVector::from_fn(counted.len(), |i, _| errors[(row, counted[i])] * weight(counted[i]));
-        let Some(both) = (by.tr_mul(&by)).cholesky() else { continue };
-        let explained = &by * both.solve(&by.tr_mul(&error));
-        // two of the elements' degrees of freedom are gone with it
-        let left = (counted.len() as f64 / (counted.len() as f64 - 2.0).max(1.0)).sqrt();
-        for (i, &column) in counted.iter().enumerate() {
-            own[(row, column)] = (error[i] - explained[i]) / weight(column) * left;
-        }
-    }
-    own
 }
 
 /// What a scale of its own gains in `ln` likelihood where a monitor errs like the others, at most in one of [`FALSE`] matrices of so many monitors: half a
