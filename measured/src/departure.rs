@@ -9,8 +9,8 @@
 //! Source: J. M. Dickey, Ann. Math. Stat. 42 (1971) 204, the ratio of posterior and prior density where nothing departs.
 
 use nalgebra::{DMatrix, DVector};
-use statrs::distribution::{ContinuousCDF, Normal};
 
+use crate::chance::deviations;
 use crate::data::Data;
 use crate::descent::descend;
 use crate::error::MeasuredError;
@@ -28,7 +28,7 @@ const FALSE: f64 = 100.0;
 
 /// Standard deviations from which on one of `unknowns` departs: 3.7 of 48, 4.4 of 900.
 pub fn clear(unknowns: usize) -> f64 {
-    -Normal::standard().inverse_cdf(0.5 / (FALSE * unknowns.max(1) as f64))
+    deviations(FALSE * unknowns.max(1) as f64)
 }
 
 /// Values that are expected of the unknowns.

@@ -195,9 +195,10 @@ impl Hierarchy {
         let classes = unknowns.iter().map(|unknown| class(folder, &groups, unknown.kind)).collect();
         let data = Data::with_coupling(folder, &fitted.outliers);
         let prediction = model.predict(&unknowns, &values)?;
-        let (places, exact) = (Places::of(&unknowns, data.measured.nrows(), data.measured.ncols()), values.len());
-        let residual = (&data.residual(&prediction), &DMatrix::zeros(exact, exact));
-        let noise = fitted.noise.learnt(&data, &places, &prediction, residual);
+        let (places, n) = (Places::of(&unknowns, data.measured.nrows(), data.measured.ncols()), values.len());
+        // what follows the data is not known yet
+        let nothing = DMatrix::zeros(n, n);
+        let noise = fitted.noise.learnt(&data, &places, &prediction, (&data.residual(&prediction), &nothing));
         let start = Start { data, groups, unknowns, values, classes, families, noise };
         start.settle(&model, ROUNDS, progress)
     }

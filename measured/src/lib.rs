@@ -11,6 +11,7 @@ pub mod alignment;
 mod arrow;
 pub mod believed;
 pub mod calibrated;
+mod chance;
 pub mod compare;
 pub mod conceal;
 pub mod data;

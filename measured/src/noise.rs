@@ -5,8 +5,8 @@
 //! count little, and do not make errors of all others look as if they had heavy tails; a stated noise that is too large is found too.
 
 use nalgebra::DMatrix;
-use statrs::distribution::{ContinuousCDF, Normal};
 
+use crate::chance::deviations;
 use crate::data::{BLOCKS, Data};
 use crate::missed::Missed;
 use crate::model::Prediction;
@@ -122,7 +122,7 @@ impl Noise {
 /// What a scale of its own gains in `ln` likelihood where a monitor errs like the others, at most in one of [`FALSE`] matrices of so many monitors: half a
 /// quantile of chi-square with one degree of freedom.
 fn by_chance(monitors: usize) -> f64 {
-    0.5 * Normal::standard().inverse_cdf(0.5 / (FALSE * monitors.max(1) as f64)).powi(2)
+    0.5 * deviations(FALSE * monitors.max(1) as f64).powi(2)
 }
 
 /// A scale that a monitor may take.
