@@ -197,7 +197,7 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
 }
 
 /// Members of a family.
-fn members(kind: &str, class: &str) -> String {
+pub(crate) fn members(kind: &str, class: &str) -> String {
     match (kind, class) {
         ("bpm_gain", plane) => format!("gains of {plane} monitors"),
         ("bpm_coupling", plane) => format!("couplings of {plane} monitors"),

@@ -6,7 +6,7 @@ use measured::{Fit, FittedOptics, Folder, Kind, unknowns};
 use report::{Axes, Band, Figure, Look, Magnet, Map, Page, Reference, Section, Series, Spotted, Strip, Symbol, Table};
 use twin::{Hold, Optics, OrbitError, Plane, Ring, Twiss};
 
-use crate::matrix_diagnosis::{ImperfectionResult, MatrixDiagnosis, MatrixFinding, number};
+use crate::matrix_diagnosis::{ImperfectionResult, MatrixDiagnosis, MatrixFinding, members, number};
 use crate::matrix_result::{Comparison, MatrixFit, Row, rows};
 
 /// Elements of a matrix up to which each is drawn: more are too small to be seen.
@@ -341,11 +341,11 @@ fn findings(found: &MatrixDiagnosis) -> Section {
     };
     let ordinary = |one: &ImperfectionResult| {
         let numbers = [one.mean, one.scatter, one.sigma].map(|value| number(value, one.unit));
-        [one.kind.to_owned(), one.at.clone(), one.members.to_string()].into_iter().chain(numbers).collect()
+        [members(one.kind, &one.at), one.members.to_string()].into_iter().chain(numbers).collect()
     };
     let families = Table {
         caption: "What an ordinary ring has, family by family: mean and scatter of the members, and the error bar of one (median).".into(),
-        header: ["what", "of", "members", "mean", "scatter", "error bar"].map(str::to_owned).to_vec(),
+        header: ["what", "members", "mean", "scatter", "error bar"].map(str::to_owned).to_vec(),
         rows: found.imperfections.iter().map(ordinary).collect(),
     };
     let unexplained = Table {
