@@ -13,7 +13,7 @@ use crate::hierarchy::Hierarchy;
 use crate::lattice::parts;
 use crate::model::Model;
 use crate::uncertainty::{Marginal, Uncertainty};
-use crate::unknowns::{Groups, Kind, Unknown};
+use crate::unknowns::{Groups, Unknown};
 
 /// What was fitted: groups of magnets, unknowns, values, and how well they are known.
 #[derive(Debug, Clone, Copy)]
@@ -64,10 +64,8 @@ impl<'f> FittedRing<'f> {
     /// [`MeasuredError::Lattice`].
     pub fn of(folder: &Folder, fit: impl Into<Fitted<'f>>, settings: &Settings) -> Result<Self, MeasuredError> {
         let fit = fit.into();
-        let is_magnet = |kind: Kind| {
-            matches!(kind, Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_))
-        };
-        let magnets: Vec<usize> = (0..fit.unknowns.len()).filter(|&at| is_magnet(fit.unknowns[at].kind)).collect();
+        let is_magnet = |at: &usize| fit.unknowns[*at].kind.is_of_machine();
+        let magnets: Vec<usize> = (0..fit.unknowns.len()).filter(is_magnet).collect();
         let uncertainty = fit.uncertainty.among(&magnets);
         Ok(Self { model: Model::of(folder, fit.groups, settings.rf)?, fit, magnets, uncertainty })
     }
@@ -128,6 +126,7 @@ mod tests {
     use super::*;
     use crate::fit::fit;
     use crate::testing::{NOISE, machine, measured, ring};
+    use crate::unknowns::Kind;
     use twin::{Hold, Optics};
 
     /// Mean square error over the variance of both tunes, and of beta at all places, of six imperfect rings.
