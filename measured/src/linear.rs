@@ -1,20 +1,25 @@
 //! Products, factors and inverses of matrices of hundreds and thousands, by faer: nalgebra's are several times slower there.
 //!
-//! Work is cut into as many lanes on every computer, each a thread, and their results are added in order: no number depends on how many run at once.
+//! Work is cut into as many lanes on every computer, and their results are added in order: no number depends on how many run at once. Each lane is a thread where
+//! the work takes longer than starting one.
 
 use faer::linalg::matmul::{matmul, triangular};
 use faer::linalg::solvers::{DenseSolveCore, Llt, SolveCore};
 use faer::{Accum, Conj, MatMut, MatRef, Par, Side};
 use nalgebra::{DMatrix, DVector};
 
-/// Threads of one sum.
+/// Parts of one sum.
 pub const LANES: usize = 4;
+/// Multiplications from which on each lane is a thread; the small rings of the tests take three times as long where all are.
+const THREADED: usize = 1 << 21;
 
-/// What a function makes of some items, cut into lanes.
-pub fn in_lanes<T: Send>(items: &[usize], each: impl Fn(&[usize]) -> T + Sync) -> Vec<T> {
-    let each = &each;
+/// What a function makes of some items, cut into lanes, of so many multiplications in all.
+pub fn in_lanes<T: Send>(items: &[usize], work: usize, each: impl Fn(&[usize]) -> T + Sync) -> Vec<T> {
+    let (each, lanes) = (&each, items.chunks(items.len().div_ceil(LANES).max(1)));
+    if work < THREADED {
+        return lanes.map(each).collect();
+    }
     std::thread::scope(|scope| {
-        let lanes = items.chunks(items.len().div_ceil(LANES).max(1));
         let lanes: Vec<_> = lanes.map(|items| scope.spawn(move || each(items))).collect();
         lanes.into_iter().map(|lane| lane.join().expect("a lane does not panic")).collect()
     })
@@ -56,26 +61,27 @@ pub fn inverse(matrix: &DMatrix<f64>) -> Option<DMatrix<f64>> {
 
 /// `A B`, its columns in lanes.
 pub fn product(left: &DMatrix<f64>, right: &DMatrix<f64>) -> DMatrix<f64> {
-    of_columns(left.nrows(), right, |columns, into| {
+    of_columns(left.nrows(), left.ncols(), right, |columns, into| {
         matmul(into, Accum::Replace, view(left), columns, 1.0, Par::Seq);
     })
 }
 
 /// `A^T B`, its columns in lanes.
 pub fn transposed_product(left: &DMatrix<f64>, right: &DMatrix<f64>) -> DMatrix<f64> {
-    of_columns(left.ncols(), right, |columns, into| {
+    of_columns(left.ncols(), left.nrows(), right, |columns, into| {
         matmul(into, Accum::Replace, view(left).transpose(), columns, 1.0, Par::Seq);
     })
 }
 
-/// What is made of the columns of a matrix, lane by lane.
+/// What is made of the columns of a matrix, lane by lane, with so many multiplications an element.
 fn of_columns(
     rows: usize,
+    depth: usize,
     right: &DMatrix<f64>,
     make: impl Fn(MatRef<'_, f64>, MatMut<'_, f64>) + Sync,
 ) -> DMatrix<f64> {
     let columns: Vec<usize> = (0..right.ncols()).collect();
-    let lanes = in_lanes(&columns, |columns| {
+    let lanes = in_lanes(&columns, rows * depth * columns.len(), |columns| {
         let mut made = vec![0.0; rows * columns.len()];
         let from = view(right).subcols(columns[0], columns.len());
         make(from, MatMut::from_column_major_slice_mut(&mut made, rows, columns.len()));

@@ -75,7 +75,7 @@ impl Places {
     /// `J^T` of weighted elements.
     pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>, unknowns: usize) -> DVector<f64> {
         let mut back = DVector::zeros(unknowns);
-        let of_machine = in_lanes(&every(weighted.ncols()), |columns| {
+        let of_machine = in_lanes(&every(weighted.ncols()), weighted.len() * self.machine, |columns| {
             let said = |&column: &usize| at.by_machine.column(column).tr_mul(&weighted.column(column));
             columns.iter().map(said).fold(DVector::zeros(self.machine), |sum, one| sum + one)
         });
@@ -93,7 +93,7 @@ impl Places {
     /// `J` times a step of the unknowns.
     pub fn forward(&self, at: &Prediction, step: &DVector<f64>) -> DMatrix<f64> {
         let of_machine = step.rows(0, self.machine);
-        let lanes = in_lanes(&every(at.matrix.ncols()), |columns| {
+        let lanes = in_lanes(&every(at.matrix.ncols()), at.matrix.len() * self.machine, |columns| {
             let moved = |&column: &usize| {
                 let mut sum = at.by_machine.column(column) * of_machine;
                 for (row, sum) in sum.iter_mut().enumerate() {
@@ -109,7 +109,7 @@ impl Places {
     /// `J C J^T` of each element by itself: the variance that a covariance of the unknowns gives it.
     pub fn variance(&self, at: &Prediction, covariance: &DMatrix<f64>) -> DMatrix<f64> {
         let of_machine = covariance.view((0, 0), (self.machine, self.machine)).into_owned();
-        let lanes = in_lanes(&every(at.matrix.ncols()), |columns| {
+        let lanes = in_lanes(&every(at.matrix.ncols()), at.matrix.len() * self.machine.pow(2), |columns| {
             columns
                 .iter()
                 .map(|&column| self.variance_of_column(at, column, (covariance, &of_machine)))
@@ -178,7 +178,9 @@ impl Normal {
         [rows, columns]: &[Vec<usize>; 2],
         unknowns: usize,
     ) -> Self {
-        let lanes = in_lanes(columns, |columns| OfMachine::of_columns(places, at, data, (rows, columns), unknowns));
+        let work = rows.len() * columns.len() * places.machine.pow(2);
+        let lanes =
+            in_lanes(columns, work, |columns| OfMachine::of_columns(places, at, data, (rows, columns), unknowns));
         let mut normal =
             Self { matrix: DMatrix::zeros(unknowns, unknowns), slope: DVector::zeros(unknowns), chi2: 0.0 };
         for lane in lanes {
