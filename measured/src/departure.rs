@@ -12,7 +12,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::chance::deviations;
 use crate::data::Data;
-use crate::descent::descend;
+use crate::descent::{EXACT, descend};
 use crate::error::MeasuredError;
 use crate::fit::{Learnt, with_model_error};
 use crate::model::Model;
@@ -68,7 +68,7 @@ impl Departures {
         let mut unknowns: Vec<Unknown> =
             held.map(|(one, &mean)| Unknown { mean, width: beforehand(one.kind), ..*one }).collect();
         loop {
-            let start = descend(model, &unknowns, &data.measured, &data.stated(), expected.values.clone())?;
+            let start = descend(model, &unknowns, &data.measured, &data.stated(), (expected.values.clone(), EXACT))?;
             let Learnt { here, noise, uncertainty } = with_model_error(model, &unknowns, data, start, progress)?;
             let held = Held::of((&unknowns, &here.values, &here.prediction), (data, &noise), &uncertainty.independent);
             let clear = clear(unknowns.len());

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 use twin::{Gradient, Observer, Optics, ResponseFactors, Source};
 
 /// What changes in an element.
@@ -98,6 +98,15 @@ impl ByMachine {
         made
     }
 
+    /// Sum of all derivatives by each unknown, each times a weight: the elements' slope, without a derivative.
+    pub fn back(&self, weights: &DMatrix<f64>) -> DVector<f64> {
+        let of_hold = |(counts, hold): &(f64, OfHold)| hold.back(&self.pieces, weights) * *counts;
+        let changes = self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something");
+        let of_group = |group: &Vec<(usize, f64)>| group.iter().map(|&(number, share)| share * changes[number]).sum();
+        let by_share = self.by_share.iter().map(|by_share| by_share.dot(weights));
+        DVector::from_iterator(self.count(), self.groups.iter().map(of_group).chain(by_share))
+    }
+
     /// The same by every number that changes.
     fn of_changes(&self, column: usize) -> DMatrix<f64> {
         let of_hold = |(counts, hold): &(f64, OfHold)| hold.column(self.pieces.get(column), self.rows) * *counts;
@@ -114,6 +123,13 @@ impl OfHold {
             pieces.iter().for_each(|&piece| self.factors.add(piece, gradient, into.as_mut_slice()));
         }
         made
+    }
+
+    fn back(&self, pieces: &[Vec<usize>], weights: &DMatrix<f64>) -> DVector<f64> {
+        let corrector = (0..pieces.len()).flat_map(|column| pieces[column].iter().map(move |_| column));
+        let back = self.factors.back(&weights.select_columns(&corrector.collect::<Vec<_>>()));
+        let last = weights.columns_range(pieces.len()..);
+        self.dispersion.iter().fold(back, |back, dispersion| back + dispersion.tr_mul(&last).column(0))
     }
 }
 

@@ -1,4 +1,5 @@
-//! The most probable values of the unknowns for elements that count what they count: damped Gauss-Newton.
+//! The most probable values of the unknowns for elements that count what they count: damped Gauss-Newton. The slope is made at each point; the curvature, most of
+//! the work, serves as long as steps gain what it promises.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -11,9 +12,17 @@ use crate::unknowns::Unknown;
 
 /// Steps of one descent; those of measured rings take 5 to 60.
 const STEPS: usize = 100;
-/// A descent has ended when the best step promises less than this, or this share of its sum of squares.
+/// A descent has ended when the best step promises less than this, or a share of its sum of squares.
 const ENOUGH: f64 = 1e-3;
-const ENOUGH_SHARE: f64 = 1e-7;
+/// That share of a descent whose values are told.
+pub const EXACT: f64 = 1e-7;
+/// That of one whose elements are weighed anew.
+pub const ROUGH: f64 = 1e-5;
+/// A step may gain this share more or less than promised before the curvature is made anew: what is left falls by four with each.
+const AS_PROMISED: f64 = 0.25;
+/// Damping of the first step, and that at which no step helps.
+const DAMPING: f64 = 1e-3;
+const STUCK: f64 = 1e9;
 
 /// Where a descent ended.
 pub struct Descent {
@@ -29,7 +38,26 @@ pub struct Descent {
     pub has_ended: bool,
 }
 
-/// Damped Gauss-Newton.
+/// What is descended: elements with their weights, and unknowns with their priors.
+struct Hill<'h> {
+    model: &'h Model,
+    unknowns: &'h [Unknown],
+    measured: &'h DMatrix<f64>,
+    weight: &'h DMatrix<f64>,
+    places: Places,
+    width: DVector<f64>,
+    mean: DVector<f64>,
+}
+
+/// A point of it.
+struct Point {
+    values: DVector<f64>,
+    prediction: Prediction,
+    /// Sum of squares of elements and priors.
+    height: f64,
+}
+
+/// Damped Gauss-Newton, until a step promises less than a share of the sum of squares.
 ///
 /// # Errors
 /// [`MeasuredError`].
@@ -38,72 +66,84 @@ pub fn descend(
     unknowns: &[Unknown],
     measured: &DMatrix<f64>,
     weight: &DMatrix<f64>,
-    mut values: DVector<f64>,
+    (values, share): (DVector<f64>, f64),
 ) -> Result<Descent, MeasuredError> {
-    let n = unknowns.len();
+    let each = |of: fn(&Unknown) -> f64| DVector::from_iterator(unknowns.len(), unknowns.iter().map(of));
     let places = Places::of(unknowns, measured.nrows(), measured.ncols());
     let apart = places.apart();
-    let width = DVector::from_iterator(n, unknowns.iter().map(|one| one.width));
-    let mean = DVector::from_iterator(n, unknowns.iter().map(|one| one.mean));
-    let off = |values: &DVector<f64>| (values - &mean).component_div(&width);
-    let mut prediction = model.predict(unknowns, &values)?;
-    let mut damping = 1e-3;
-    let mut step = 0;
+    let hill =
+        Hill { model, unknowns, measured, weight, places, width: each(|one| one.width), mean: each(|one| one.mean) };
+    let mut here = hill.point(values)?;
+    let mut curvature = hill.curvature(&here);
+    let (mut damping, mut step) = (DAMPING, 0);
     loop {
-        let normal = Normal::of(&places, &prediction, &residual(measured, &prediction, weight), weight, n);
-        let matrix = in_widths(normal.matrix, &width);
-        let slope = normal.slope.component_mul(&width) - off(&values);
-        let now = normal.chi2 + off(&values).norm_squared();
-        let factor = Arrow::of(&matrix, &apart).ok_or(MeasuredError::Singular(step))?;
-        let has_ended = slope.dot(&factor.solve(&slope)) < ENOUGH.max(ENOUGH_SHARE * now);
-        let further = (!has_ended && step < STEPS).then(|| {
-            let sum = |values: &DVector<f64>, at: &Prediction| {
-                let left = residual(measured, at, weight);
-                left.component_mul(&left).dot(weight) + off(values).norm_squared()
-            };
-            further(
-                model,
-                unknowns,
-                (&matrix, &slope, &apart),
-                &mut damping,
-                |moved| &values + moved.component_mul(&width),
-                |v, at| sum(v, at) < now,
-            )
-        });
-        match further.flatten() {
-            Some(better) => (values, prediction) = better,
-            None => {
-                let covariance = times(factor.inverse(), &width);
-                return Ok(Descent { values, covariance, prediction, steps: step, has_ended });
-            }
+        let slope = hill.slope(&here);
+        let factor = Arrow::of(&curvature, &apart).ok_or(MeasuredError::Singular(step))?;
+        let has_ended = slope.dot(&factor.solve(&slope)) < ENOUGH.max(share * here.height);
+        let further = (!has_ended && step < STEPS)
+            .then(|| hill.further(&here, (&curvature, &slope, &apart), &mut damping))
+            .flatten();
+        let Some((there, promised)) = further else {
+            let covariance = times(factor.inverse(), &hill.width);
+            let Point { values, prediction, .. } = here;
+            return Ok(Descent { values, covariance, prediction, steps: step, has_ended });
+        };
+        let is_as_promised = ((here.height - there.height) / promised - 1.0).abs() < AS_PROMISED;
+        here = there;
+        if !is_as_promised {
+            curvature = hill.curvature(&here);
         }
         step += 1;
     }
 }
 
-/// The first better point along the curve of damped steps, from the longest on; none where not even a millionth of a step is better: the
-/// best ring is one at the edge of stability.
-fn further(
-    model: &Model,
-    unknowns: &[Unknown],
-    (matrix, slope, apart): (&DMatrix<f64>, &DVector<f64>, &[Vec<usize>]),
-    damping: &mut f64,
-    to: impl Fn(&DVector<f64>) -> DVector<f64>,
-    is_better: impl Fn(&DVector<f64>, &Prediction) -> bool,
-) -> Option<(DVector<f64>, Prediction)> {
-    while *damping < 1e9 {
-        let mut damped = matrix.clone();
-        for i in 0..slope.len() {
-            damped[(i, i)] *= 1.0 + *damping;
-        }
-        let values = to(&Arrow::of(&damped, apart)?.solve(slope));
-        match model.predict(unknowns, &values) {
-            Ok(at) if is_better(&values, &at) => {
-                *damping = (*damping * 0.1).max(1e-9);
-                return Some((values, at));
-            }
-            _ => *damping *= 10.0,
-        }
+impl Hill<'_> {
+    fn point(&self, values: DVector<f64>) -> Result<Point, MeasuredError> {
+        let prediction = self.model.predict(self.unknowns, &values)?;
+        let left = residual(self.measured, &prediction, self.weight);
+        let height = left.component_mul(&left).dot(self.weight) + self.off(&values).norm_squared();
+        Ok(Point { values, prediction, height })
     }
-    None
+
+    /// Distance from the means, in widths.
+    fn off(&self, values: &DVector<f64>) -> DVector<f64> {
+        (values - &self.mean).component_div(&self.width)
+    }
+
+    /// Half the slope downhill, in widths.
+    fn slope(&self, here: &Point) -> DVector<f64> {
+        let weighted = residual(self.measured, &here.prediction, self.weight).component_mul(self.weight);
+        let back = self.places.back(&here.prediction, &weighted, self.width.len());
+        back.component_mul(&self.width) - self.off(&here.values)
+    }
+
+    /// Half the curvature, in widths.
+    fn curvature(&self, here: &Point) -> DMatrix<f64> {
+        let nothing = DMatrix::zeros(self.weight.nrows(), self.weight.ncols());
+        let n = self.width.len();
+        in_widths(Normal::of(&self.places, &here.prediction, &nothing, self.weight, n).matrix, &self.width)
+    }
+
+    /// The first better point along the curve of damped steps, from the longest on, and how much lower it was promised to be; none where not even a millionth of a
+    /// step is better: the best ring is one at the edge of stability.
+    fn further(
+        &self,
+        here: &Point,
+        (curvature, slope, apart): (&DMatrix<f64>, &DVector<f64>, &[Vec<usize>]),
+        damping: &mut f64,
+    ) -> Option<(Point, f64)> {
+        while *damping < STUCK {
+            let mut damped = curvature.clone();
+            (0..slope.len()).for_each(|i| damped[(i, i)] *= 1.0 + *damping);
+            let step = Arrow::of(&damped, apart)?.solve(slope);
+            match self.point(&here.values + step.component_mul(&self.width)) {
+                Ok(there) if there.height < here.height => {
+                    *damping = (*damping * 0.1).max(1e-9);
+                    return Some((there, slope.dot(&step)));
+                }
+                _ => *damping *= 10.0,
+            }
+        }
+        None
+    }
 }

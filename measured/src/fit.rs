@@ -12,7 +12,7 @@ use nalgebra::{DMatrix, DVector};
 use twin::Rf;
 
 use crate::data::Data;
-use crate::descent::{Descent, descend};
+use crate::descent::{Descent, EXACT, ROUGH, descend};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::linear::LANES;
@@ -111,7 +111,7 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     loop {
         progress(&format!("as stated, {} outliers", outliers.len()));
         let before = as_stated.steps;
-        as_stated = descend(&model, &unknowns, &data.measured, &data.stated(), as_stated.values)?;
+        as_stated = descend(&model, &unknowns, &data.measured, &data.stated(), (as_stated.values, ROUGH))?;
         as_stated.steps += before;
         let further = data.set_outliers_aside(&as_stated.prediction);
         if further.is_empty() {
@@ -163,13 +163,13 @@ pub fn with_model_error(
     progress: &mut dyn FnMut(&str),
 ) -> Result<Learnt, MeasuredError> {
     let (mut here, mut noise, mut steps) = (from, Noise::stated(data.measured.nrows()), 0);
+    let places = Places::of(unknowns, data.measured.nrows(), data.measured.ncols());
     for round in 1..=ROUNDS {
         progress(&format!("error of the model, round {round} of {ROUNDS}"));
         let residual = data.residual(&here.prediction);
-        let places = Places::of(unknowns, residual.nrows(), residual.ncols());
         noise = noise.learnt(data, &places, &here.prediction, (&residual, &here.covariance));
         let weight = data.weight(&noise, &residual);
-        here = descend(model, unknowns, &data.measured, &weight, here.values)?;
+        here = descend(model, unknowns, &data.measured, &weight, (here.values, EXACT))?;
         steps += here.steps;
     }
     let uncertainty = Uncertainty::of(unknowns, &here.prediction, data, &noise)?;

@@ -111,7 +111,7 @@ impl HeldOut {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::descent::descend;
+    use crate::descent::{EXACT, descend};
     use crate::fit::{Settings, fit};
     use crate::model::Model;
     use crate::testing::{NOISE, machine, measured, ring};
@@ -143,7 +143,8 @@ mod tests {
             let is_out = |row: usize, column: usize| row % PARTS == part / PARTS && column % PARTS == part % PARTS;
             let without = DMatrix::from_fn(rows, columns, |i, j| if is_out(i, j) { 0.0 } else { weight[(i, j)] });
             let there =
-                descend(&model, &fitted.unknowns, &fitted.data.measured, &without, fitted.values.clone()).unwrap();
+                descend(&model, &fitted.unknowns, &fitted.data.measured, &without, (fitted.values.clone(), EXACT))
+                    .unwrap();
             let left = fitted.data.residual(&there.prediction);
             squares += (0..rows * columns)
                 .map(|k| (k % rows, k / rows))

@@ -6,7 +6,7 @@
 use nalgebra::DVector;
 use twin::{Plane, Rf};
 
-use crate::descent::descend;
+use crate::descent::{EXACT, descend};
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Learnt, Settings, fit, with_model_error};
 use crate::folder::Folder;
@@ -52,7 +52,7 @@ impl Share {
         values.insert(place, believed);
         let (model, data) = (Model::of(folder, &fitted.groups, settings.rf)?, &fitted.data);
         let weight = data.weight(&fitted.noise, &fitted.residual);
-        let start = descend(&model, &unknowns, &data.measured, &weight, DVector::from_vec(values))?;
+        let start = descend(&model, &unknowns, &data.measured, &weight, (DVector::from_vec(values), EXACT))?;
         let Learnt { here, noise, uncertainty } = with_model_error(&model, &unknowns, data, start, progress)?;
         let (value, scatter) = (here.values[place], uncertainty.sigma[place]);
         let likelihoods = data.log_likelihood(&noise, &data.residual(&here.prediction))

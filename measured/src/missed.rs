@@ -19,6 +19,10 @@ const FREEDOMS: [f64; 8] = [2.0, 3.0, 4.0, 6.0, 9.0, 15.0, 30.0, f64::INFINITY];
 /// freedom, since they can only be heavier.
 const BY_CHANCE: f64 = 4.77;
 
+/// Newton's steps for a variance at most, and how near 1 its mean is in the end.
+const STEPS: usize = 100;
+const ENOUGH: f64 = 1e-6;
+
 /// What the model misses in one block.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Missed {
@@ -50,31 +54,49 @@ impl Missed {
 
     /// `ln p(r)` of a residual [mm].
     pub fn log_likelihood(&self, sigma: f64, residual: f64) -> f64 {
-        let (nu, spread) = (self.freedom, self.spread(sigma));
-        let square = (residual / spread).powi(2);
-        let shape = match nu.is_finite() {
-            true => {
-                ln_gamma((nu + 1.0) / 2.0)
-                    - ln_gamma(nu / 2.0)
-                    - 0.5 * (nu / 2.0).ln()
-                    - (nu + 1.0) / 2.0 * (square / nu).ln_1p()
-            }
-            false => -0.5 * square,
-        };
-        shape - spread.ln() - 0.5 * core::f64::consts::TAU.ln()
+        self.log_norm() + self.log_shape(sigma, residual)
     }
 
-    /// Most probable for a block's elements, each with its error and its stated noise [mm].
-    pub fn most_probable(elements: &[(f64, f64)]) -> Self {
+    /// The same less what all residuals have in common.
+    pub fn log_shape(&self, sigma: f64, residual: f64) -> f64 {
+        let variance = self.scale * self.scale + sigma * sigma;
+        let (nu, square) = (self.freedom, residual * residual / variance);
+        let shape = if nu.is_finite() { -0.5 * (nu + 1.0) * (square / nu).ln_1p() } else { -0.5 * square };
+        shape - 0.5 * variance.ln()
+    }
+
+    /// What all residuals have in common.
+    fn log_norm(&self) -> f64 {
+        let nu = self.freedom;
+        let root_of_nu =
+            if nu.is_finite() { ln_gamma((nu + 1.0) / 2.0) - ln_gamma(nu / 2.0) - 0.5 * (nu / 2.0).ln() } else { 0.0 };
+        root_of_nu - 0.5 * core::f64::consts::TAU.ln()
+    }
+
+    /// Most probable for a block's elements, each with its error and its stated noise [mm]: tails are tried from these on, as long as they are more probable.
+    pub fn most_probable(self, elements: &[(f64, f64)]) -> Self {
         if elements.is_empty() {
             return Self::NOTHING;
         }
-        let told = |one: &Self| {
-            let chance = if one.freedom.is_finite() { BY_CHANCE } else { 0.0 };
-            elements.iter().map(|&(error, sigma)| one.log_likelihood(sigma, error)).sum::<f64>() - chance
+        let told = |freedom: f64| {
+            let one = Self { scale: scale(elements, freedom), freedom };
+            let shape = elements.iter().map(|&(error, sigma)| one.log_shape(sigma, error)).sum::<f64>();
+            (elements.len() as f64 * one.log_norm() + shape, one)
         };
-        let tried = FREEDOMS.map(|freedom| Self { scale: scale(elements, freedom), freedom });
-        tried.into_iter().max_by(|a, b| told(a).total_cmp(&told(b))).unwrap_or(Self::NOTHING)
+        let from = FREEDOMS.partition_point(|&freedom| freedom < self.freedom);
+        let mut best = told(FREEDOMS[from]);
+        let mut climb = |further: &mut dyn Iterator<Item = &f64>| {
+            for tried in further.map(|&freedom| told(freedom)) {
+                if tried.0 <= best.0 {
+                    break;
+                }
+                best = tried;
+            }
+        };
+        climb(&mut FREEDOMS[..from].iter().rev());
+        climb(&mut FREEDOMS[from + 1..].iter());
+        let normal = told(f64::INFINITY);
+        if best.0 > normal.0 + BY_CHANCE { best.1 } else { normal.1 }
     }
 }
 
@@ -85,22 +107,31 @@ fn share(nu: f64, over: f64, under: f64) -> f64 {
 
 /// `tau` at which the likelihood of the elements is largest: the mean of `r^2` times weight is 1.
 fn scale(elements: &[(f64, f64)], freedom: f64) -> f64 {
-    // with `z = r^2/s^2` an element's `r^2` times weight is `z (nu + 1)/(nu + z)`
-    let squares: Vec<[f64; 2]> = elements.iter().map(|(r, sigma)| [r * r, sigma * sigma]).collect();
-    let excess = |scale: f64| {
-        let share = |z: f64| if freedom.is_finite() { (freedom + 1.0) / (freedom + z) } else { 1.0 };
-        let each = squares.iter().map(|[r, sigma]| r / (scale * scale + sigma));
-        each.map(|z| z * share(z) - 1.0).sum::<f64>()
-    };
-    let (mut low, mut high) = (0.0, elements.iter().map(|(r, _)| r * r).sum::<f64>().sqrt());
-    if excess(0.0) <= 0.0 {
-        return 0.0;
+    let tails = freedom.recip();
+    let square = |&(r, sigma): &(f64, f64)| [(1.0 + tails) * r * r, 1.0, sigma * sigma + tails * r * r];
+    variance(0.0, elements.iter().map(square)).sqrt()
+}
+
+/// The `v` from some start on at which the mean of `a/(b v + c)` is 1, or the start where it is less.
+///
+/// The inverse of that mean is concave, so that Newton's steps on it from below never go too far.
+pub fn variance(start: f64, terms: impl Iterator<Item = [f64; 3]> + Clone) -> f64 {
+    let mut variance = start;
+    for _ in 0..STEPS {
+        let (mut count, mut sum, mut slope) = (0.0, 0.0, 0.0);
+        for [a, b, c] in terms.clone() {
+            let below = (b * variance + c).recip();
+            count += 1.0;
+            sum += a * below;
+            slope += a * below * b * below;
+        }
+        let mean: f64 = sum / count;
+        if mean.is_nan() || mean < 1.0 + ENOUGH {
+            break;
+        }
+        variance += mean * (mean - 1.0) * count / slope;
     }
-    while high - low > 1e-6 * high {
-        let middle = 0.5 * (low + high);
-        if excess(middle) > 0.0 { low = middle } else { high = middle }
-    }
-    0.5 * (low + high)
+    variance
 }
 
 #[cfg(test)]
@@ -129,12 +160,24 @@ mod tests {
     }
 
     #[test]
+    fn a_variance_makes_the_mean_one() {
+        let terms =
+            |tails: f64| (1..50).map(move |i| [f64::from(i).powi(3), 1e3 / f64::from(i), 0.1 + tails * f64::from(i)]);
+        for tails in [0.0, 2.0] {
+            let found = variance(0.0, terms(tails));
+            let mean = terms(tails).map(|[a, b, c]| a / (b * found + c)).sum::<f64>() / 49.0;
+            assert!((mean - 1.0).abs() < 2.0 * ENOUGH, "{mean}");
+        }
+        assert_eq!(variance(0.5, [[0.1, 1.0, 0.0]].into_iter()), 0.5);
+    }
+
+    #[test]
     fn size_and_tails_are_learnt() {
         let mut random = StdRng::seed_from_u64(3);
         for freedom in [2.0, 4.0, 1e9] {
             let noise = StudentT::new(freedom).unwrap();
             let elements: Vec<(f64, f64)> = (0..4000).map(|_| (0.02 * noise.sample(&mut random), 1e-4)).collect();
-            let missed = Missed::most_probable(&elements);
+            let missed = Missed::NOTHING.most_probable(&elements);
             // 4000 elements tell the scale to 1.1 % sqrt((nu + 3)/nu) and 1/nu to about 0.015: four standard deviations
             assert!((missed.scale / 0.02 - 1.0).abs() < 0.07, "{missed:?}");
             assert!((1.0 / missed.freedom - 1.0 / freedom).abs() < 0.06, "{missed:?}");

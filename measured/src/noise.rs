@@ -8,16 +8,14 @@ use nalgebra::DMatrix;
 
 use crate::chance::deviations;
 use crate::data::{BLOCKS, Data};
-use crate::missed::Missed;
+use crate::missed::{Missed, variance};
 use crate::model::Prediction;
 use crate::normal::Places;
 
 /// Matrices of normal errors in which any monitor has a scale of its own: one in so many.
 const FALSE: f64 = 1000.0;
-/// Scales that are tried, as logarithms.
+/// Scales are within these, as logarithms.
 const SCALES: [f64; 2] = [-5.0, 10.0];
-/// Resolution of a scale.
-const RESOLUTION: f64 = 1e-4;
 /// Of scales that gain, those with this share of the largest gain are taken at once: others may be explained then.
 const AT_ONCE: f64 = 0.5;
 /// Gain that is worth a turn [nat], and turns of blocks and monitors at most.
@@ -87,7 +85,8 @@ impl Noise {
                 of_blocks[block].push((error / scale, sigma));
             }
         }
-        of_blocks.map(|elements| Missed::most_probable(&elements))
+        let mut former = self.blocks.iter();
+        of_blocks.map(|elements| former.next().expect("a block each").most_probable(&elements))
     }
 
     /// The scale of a monitor, 1 where another one gains no more than chance does.
@@ -96,22 +95,15 @@ impl Noise {
             elements(data, errors, row).map(|(block, sigma, error)| (self.blocks[block], sigma, error)).collect();
         let told = |log: f64| {
             let scale = log.exp();
-            all.iter().map(|(block, sigma, error)| block.log_likelihood(*sigma, error / scale) - log).sum::<f64>()
+            all.iter().map(|(block, sigma, error)| block.log_shape(*sigma, error / scale) - log).sum::<f64>()
         };
         // the mean of squares times weight is 1 where the likelihood is largest
-        let is_wide = |log: f64| {
-            let square = |(block, sigma, error): &(Missed, f64, f64)| {
-                let error = error / log.exp();
-                error * error * block.weight(*sigma, error)
-            };
-            all.iter().map(square).sum::<f64>() < all.len() as f64
+        let square = |(block, sigma, error): &(Missed, f64, f64)| {
+            let (tails, square) = (block.freedom.recip(), error * error);
+            [(1.0 + tails) * square, block.spread(*sigma).powi(2), tails * square]
         };
-        let [mut low, mut high] = SCALES;
-        while high - low > RESOLUTION {
-            let middle = 0.5 * (low + high);
-            if is_wide(middle) { high = middle } else { low = middle }
-        }
-        let log = 0.5 * (low + high);
+        let [least, most] = SCALES;
+        let log = (0.5 * variance((2.0 * least).exp(), all.iter().map(square)).ln()).min(most);
         let (alike, own) = (told(0.0), told(log) - chance);
         let present = self.monitors[row];
         let now = if present == 1.0 { alike } else { told(present.ln()) - chance };

@@ -17,8 +17,6 @@ pub struct Normal {
     pub matrix: DMatrix<f64>,
     /// `J^T W r`.
     pub slope: DVector<f64>,
-    /// `r^T W r`.
-    pub chi2: f64,
 }
 
 /// Where the unknowns of each row and column stand.
@@ -75,11 +73,7 @@ impl Places {
     /// `J^T` of weighted elements.
     pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>, unknowns: usize) -> DVector<f64> {
         let mut back = DVector::zeros(unknowns);
-        let of_machine = in_lanes(&every(weighted.ncols()), weighted.len() * self.machine, |columns| {
-            let said = |&column: &usize| at.by_machine.column(column).tr_mul(&weighted.column(column));
-            columns.iter().map(said).fold(DVector::zeros(self.machine), |sum, one| sum + one)
-        });
-        of_machine.iter().for_each(|one| back.rows_mut(0, self.machine).add_assign(one));
+        back.rows_mut(0, self.machine).copy_from(&at.by_machine.back(weighted));
         for column in 0..weighted.ncols() {
             for row in (0..weighted.nrows()).filter(|&row| weighted[(row, column)] != 0.0) {
                 for (one, by) in self.instruments(at, row, column) {
@@ -181,8 +175,7 @@ impl Normal {
         let work = rows.len() * columns.len() * places.machine.pow(2);
         let lanes =
             in_lanes(columns, work, |columns| OfMachine::of_columns(places, at, data, (rows, columns), unknowns));
-        let mut normal =
-            Self { matrix: DMatrix::zeros(unknowns, unknowns), slope: DVector::zeros(unknowns), chi2: 0.0 };
+        let mut normal = Self { matrix: DMatrix::zeros(unknowns, unknowns), slope: DVector::zeros(unknowns) };
         for lane in lanes {
             normal.matrix.columns_mut(0, places.machine).add_assign(&lane.left);
             normal.slope.rows_mut(0, places.machine).add_assign(&lane.slope);
@@ -206,7 +199,6 @@ impl Normal {
             if w <= 0.0 {
                 continue;
             }
-            self.chi2 += w * r * r;
             each.clear();
             each.extend(places.instruments(at, row, column));
             for &(one, by) in &each {

@@ -6,7 +6,7 @@
 //!
 //! as in [`Optics::response_jacobian`], whose matrices these are.
 
-use nalgebra::{Matrix6, RowVector6, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix6, RowVector6, Vector6};
 
 use crate::response::{Gradient, Observer, Optics, Place, Source, seen_rows};
 
@@ -17,8 +17,9 @@ pub struct ResponseFactors {
     observers: Vec<(Place, [RowVector6<f64>; 2])>,
     /// Each source with what it sends to places before and behind it.
     sources: Vec<(Source, [Vector6<f64>; 2])>,
-    /// Each gradient with `-a (W + step) Q`, rows observers.
-    gradients: Vec<(Gradient, [Vec<f64>; 6])>,
+    gradients: Vec<Gradient>,
+    /// `-a (W + step) Q`, rows observers, six columns a gradient.
+    seen: DMatrix<f64>,
 }
 
 impl Optics<'_> {
@@ -31,16 +32,17 @@ impl Optics<'_> {
     ) -> ResponseFactors {
         let seen = observers.iter().map(|one| one.place).zip(seen_rows(observers, &self.closed)).collect::<Vec<_>>();
         let far = self.closed + Matrix6::identity();
-        let through = |gradient: Gradient| {
-            let rows: Vec<_> = seen
-                .iter()
-                .map(|(place, rows)| -(rows[usize::from(gradient.place < *place)] * gradient.kernel))
-                .collect();
-            (gradient, core::array::from_fn(|column| rows.iter().map(|row| row[column]).collect()))
-        };
+        let mut through = DMatrix::zeros(seen.len(), 6 * gradients.len());
+        for (number, gradient) in gradients.iter().enumerate() {
+            for (row, (place, rows)) in seen.iter().enumerate() {
+                let seen = -(rows[usize::from(gradient.place < *place)] * gradient.kernel);
+                through.fixed_view_mut::<1, 6>(row, 6 * number).copy_from(&seen);
+            }
+        }
         ResponseFactors {
             sources: sources.iter().map(|one| (*one, [self.closed * one.column, far * one.column])).collect(),
-            gradients: gradients.into_iter().map(through).collect(),
+            gradients,
+            seen: through,
             observers: seen,
         }
     }
@@ -54,28 +56,56 @@ impl ResponseFactors {
 
     /// Add the derivative of a source's orbit at all observers by a gradient.
     pub fn add(&self, source: usize, gradient: usize, into: &mut [f64]) {
-        let (source, [near, far]) = &self.sources[source];
-        let (gradient, seen) = &self.gradients[gradient];
-        let within = gradient.within(source);
-        let sent = if within.is_none() && source.place <= gradient.place { far } else { near };
+        let (sent, within) = self.sent(source, gradient);
         // slices of one length: the loop is over four or eight observers at once
         let rows = into.len();
-        let [x, px, y, py, delta, path] = seen.each_ref().map(|column| &column[..rows]);
+        let column = |number: usize| &self.seen.as_slice()[(6 * gradient + number) * self.seen.nrows()..][..rows];
+        let [x, px, y, py, delta, path] = core::array::from_fn(column);
         let [to_x, to_px, to_y, to_py, to_delta, to_path] = (*sent).into();
         for i in 0..rows {
             let [a, b] = [x[i] * to_x + px[i] * to_px, y[i] * to_y + py[i] * to_py];
             into[i] += a + b + (delta[i] * to_delta + path[i] * to_path);
         }
         if let Some(within) = within {
-            for (into, (place, rows)) in into.iter_mut().zip(&self.observers) {
-                *into -= (rows[usize::from(gradient.place < *place)] * within)[0];
-            }
+            let within = self.seen_of_within(gradient, within);
+            into.iter_mut().zip(within).for_each(|(into, within)| *into -= within);
         }
+    }
+
+    /// `sum_ij w_ij dG_ij/dk` of each gradient `k`, with weights of all observers, the rows, and sources, the columns: one product, without a derivative.
+    pub fn back(&self, weights: &DMatrix<f64>) -> DVector<f64> {
+        let through = weights.transpose() * &self.seen;
+        DVector::from_fn(self.count(), |gradient, _| {
+            let said = |source: usize| {
+                let (sent, within) = self.sent(source, gradient);
+                let left = within.map_or(0.0, |within| {
+                    let weights = weights.column(source);
+                    self.seen_of_within(gradient, within).zip(&weights).map(|(within, weight)| within * weight).sum()
+                });
+                (through.fixed_view::<1, 6>(source, 6 * gradient) * sent)[0] - left
+            };
+            (0..self.sources.len()).map(said).sum()
+        })
+    }
+
+    /// What a source sends to a gradient, and what of it is counted within the gradient's element if the source is there.
+    fn sent(&self, source: usize, gradient: usize) -> (&Vector6<f64>, Option<Vector6<f64>>) {
+        let (source, [near, far]) = &self.sources[source];
+        let gradient = &self.gradients[gradient];
+        let within = gradient.within(source);
+        (if within.is_none() && source.place <= gradient.place { far } else { near }, within)
+    }
+
+    fn seen_of_within(&self, gradient: usize, within: Vector6<f64>) -> impl Iterator<Item = f64> {
+        let before = self.gradients[gradient].place;
+        self.observers.iter().map(move |(place, rows)| (rows[usize::from(before < *place)] * within)[0])
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::DMatrix;
+
     use crate::{Hold, Optics, Plane, Ring};
 
     #[test]
@@ -96,6 +126,10 @@ mod tests {
                 let off = made.iter().zip(&exact).map(|(made, exact)| (made - exact).abs()).fold(0.0, f64::max);
                 assert!(off < 1e-12 * matrix.amax(), "{gradient} {source}: {off}");
             }
+        }
+        let weights = DMatrix::from_fn(observers.len(), sources.len(), |i, j| (1.0 + (3 * i + 7 * j) as f64).sin());
+        for (back, matrix) in factors.back(&weights).iter().zip(&matrices) {
+            assert!((back - weights.dot(matrix)).abs() < 1e-12 * matrix.norm(), "rounding");
         }
     }
 }
