@@ -196,13 +196,13 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
 
 /// True of what has no family to stand out of, or of which each tells its own story, and changed too far for chance: the factor of all gradients, the RF step, wigglers.
 fn is_told_alone(changed: &Hierarchy, number: usize) -> bool {
-    let (change, sigma) = change(changed, number);
     let is_alone = match changed.unknowns[number].kind {
         Kind::Strength(_) => changed.classes[number] == ALL,
         Kind::RfScale | Kind::Wiggler(_) | Kind::Added(_) => true,
         _ => false,
     };
-    is_alone && change.abs() > clear(changed.unknowns.len()) * sigma
+    let is_clear = |(change, sigma): (f64, f64)| change.abs() > clear(changed.unknowns.len()) * sigma;
+    is_alone && is_clear(change(changed, number))
 }
 
 /// Change of an unknown beside its family, with its standard deviation: of gains by a share of themselves, the common scale of their plane tells nothing.
@@ -234,10 +234,11 @@ fn gradients(folder: &Folder, before: &Hierarchy, changed: &Hierarchy) -> Vec<Ch
     let has_factor = |group: usize| changed.unknowns.iter().any(|one| one.kind == Kind::Strength(group));
     let is_single =
         |&group: &usize| has_factor(group) && !strengths.iter().any(|other| holds(&strengths[group], other));
+    let (of_before, of_changed) = (before.strengths(), changed.strengths());
     let mut all = Vec::new();
     for group in (0..strengths.len()).filter(is_single) {
         let rows = strengths[group].clone();
-        let ([first, _], [second, sigma]) = (before.strength(group), changed.strength(group));
+        let ([first, _], [second, sigma]) = (of_before[group], of_changed[group]);
         let (relative, sigma) = (second / first - 1.0, sigma / first.abs());
         all.push(Change {
             name: folder.element(rows[0]),

@@ -286,18 +286,26 @@ impl Hierarchy {
         }
     }
 
-    /// Strength of a group of magnets over that of the lattice, the product of all factors that they have, with its standard deviation.
-    pub fn strength(&self, group: usize) -> [f64; 2] {
-        let first = self.groups[0][group][0];
-        let mut combination = DVector::zeros(self.values.len());
-        let mut strength = 1.0;
-        for (number, unknown) in self.unknowns.iter().enumerate() {
-            if matches!(unknown.kind, Kind::Strength(other) if self.groups[0][other].contains(&first)) {
-                strength *= self.values[number];
-                combination[number] = 1.0 / self.values[number];
-            }
-        }
-        [strength, strength * self.uncertainty.variance(&combination).sqrt()]
+    /// Strength of each group of magnets over that of the lattice, the product of all factors that they have, with its standard deviation.
+    pub fn strengths(&self) -> Vec<[f64; 2]> {
+        let factor = |number: usize| match self.unknowns[number].kind {
+            Kind::Strength(group) => Some((number, &self.groups[0][group])),
+            _ => None,
+        };
+        let factors: Vec<(usize, &Magnets)> = (0..self.unknowns.len()).filter_map(factor).collect();
+        let numbers: Vec<usize> = factors.iter().map(|(number, _)| *number).collect();
+        let share = |group: usize, factor: usize| {
+            let (number, magnets) = factors[factor];
+            if magnets.contains(&self.groups[0][group][0]) { 1.0 / self.values[number] } else { 0.0 }
+        };
+        let relative = DMatrix::from_fn(self.groups[0].len(), factors.len(), share);
+        let variances = self.uncertainty.among(&numbers).variances(&relative);
+        let strength = |group: usize| {
+            let strength: f64 =
+                relative.row(group).iter().filter(|share| **share != 0.0).map(|share| 1.0 / share).product();
+            [strength, strength * variances[group].sqrt()]
+        };
+        (0..self.groups[0].len()).map(strength).collect()
     }
 
     /// Distance of a value from the mean of the family that it is of, whether it is released or not.
@@ -539,8 +547,7 @@ mod tests {
             for family in found.families.iter().filter(|family| family.is_learnt()) {
                 scatters.entry(family.kind).or_default().push(family.scale * found.unknowns[family.members[0]].width);
             }
-            for group in 0..fitted.groups[0].len() {
-                let [strength, sigma] = found.strength(group);
+            for (group, [strength, sigma]) in found.strengths().into_iter().take(fitted.groups[0].len()).enumerate() {
                 nees += ((strength - truth.2[group]) / sigma).powi(2);
                 strengths += 1;
             }

@@ -89,11 +89,13 @@ impl Uncertainty {
     /// Among some of the unknowns.
     pub fn among(&self, unknowns: &[usize]) -> Marginal {
         let directions = self.independent.select_columns(unknowns);
-        let of_lines = self.together.tr_mul(&directions);
+        let of_lines = transposed_product(&self.together, &directions);
+        let [elements, of_data] =
+            [&self.alone, &self.information].map(|form| transposed_product(&directions, &product(form, &directions)));
         Marginal {
-            lines: of_lines.tr_mul(&of_lines),
-            elements: directions.tr_mul(&(&self.alone * &directions)),
-            of_data: directions.tr_mul(&(&self.information * &directions)),
+            lines: transposed_product(&of_lines, &of_lines),
+            elements,
+            of_data,
             independent: directions.select_rows(unknowns),
         }
     }

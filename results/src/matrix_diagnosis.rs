@@ -145,7 +145,8 @@ impl MatrixDiagnosis {
             None => diagnosis.verdict.word(),
         };
         let hierarchy = &diagnosis.hierarchy;
-        let var = |&(row, group): &(usize, usize)| MatrixVar::of_row(folder, row, hierarchy.strength(group));
+        let strengths = hierarchy.strengths();
+        let var = |&(row, group): &(usize, usize)| MatrixVar::of_row(folder, row, strengths[group]);
         let value = |unknown: usize| [hierarchy.values[unknown], hierarchy.uncertainty.sigma[unknown]];
         let mut other = others(folder, (&hierarchy.groups, &hierarchy.unknowns), value);
         other.retain(|one| !one.elements.is_empty());
