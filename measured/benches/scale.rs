@@ -21,7 +21,7 @@ use twin::{Plane, Rf};
 /// Noise of an element of the matrix [mm].
 const NOISE: f64 = 0.002;
 /// Gradients up to which diagnosis and comparison are timed: beyond they take many minutes.
-const MOST: usize = 200;
+const MOST: usize = 400;
 /// Columns: gradients, response with its instruments' derivatives, all columns of the Jacobian, fit, diagnosis, comparison [s], memory [MB].
 const NAMES: [&str; 8] =
     ["gradients", "response/s", "jacobian/s", "fit/s", "fit/MB", "pull", "diagnose/s", "compare/s"];
@@ -71,7 +71,7 @@ fn measure(gradients: usize) -> Result<[f64; 8], Box<dyn Error>> {
     let (response, prediction) = timed(|| model.predict(&all, &means));
     let prediction = prediction?;
     let columns = 0..prediction.matrix.ncols();
-    let (jacobian, _) = timed(|| columns.map(|column| prediction.by_machine.column(column).sum()).sum::<f64>());
+    let (jacobian, _) = timed(|| columns.map(|column| prediction.by_machine.columns(&[column]).sum()).sum::<f64>());
     let (fit, straightened) = timed(|| Straightened::of(&before, &settings, &mut |_| ()));
     let Straightened { folder, cables, fit: fitted } = straightened?;
     let memory = peak()?;

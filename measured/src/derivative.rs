@@ -85,20 +85,22 @@ impl ByMachine {
         self.groups.len() + usize::from(self.by_share.is_some())
     }
 
-    /// Derivatives of the elements of a column, rows elements.
-    pub fn column(&self, column: usize) -> DMatrix<f64> {
-        let changes = self.of_changes(column);
-        let mut made = DMatrix::zeros(self.rows, self.count());
+    /// Derivatives of the elements of some columns in turn, rows elements.
+    pub fn columns(&self, columns: &[usize]) -> DMatrix<f64> {
+        let of_hold = |(counts, hold): &(f64, OfHold)| hold.columns(&self.pieces, columns, self.rows) * *counts;
+        let changes = self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something");
+        let mut made = DMatrix::zeros(changes.nrows(), self.count());
         for (mut into, group) in made.column_iter_mut().zip(&self.groups) {
             group.iter().for_each(|&(number, share)| into.axpy(share, &changes.column(number), 1.0));
         }
         if let Some(by_share) = &self.by_share {
-            made.set_column(self.groups.len(), &by_share.column(column));
+            let by_share = columns.iter().flat_map(|&column| by_share.column(column).into_iter().copied());
+            made.set_column(self.groups.len(), &DVector::from_iterator(changes.nrows(), by_share));
         }
         made
     }
 
-    /// Sum of all derivatives by each unknown, each times a weight: the elements' slope, without a derivative.
+    /// Sum of all derivatives by each unknown, each times a weight.
     pub fn back(&self, weights: &DMatrix<f64>) -> DVector<f64> {
         let of_hold = |(counts, hold): &(f64, OfHold)| hold.back(&self.pieces, weights) * *counts;
         let changes = self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something");
@@ -107,30 +109,51 @@ impl ByMachine {
         DVector::from_iterator(self.count(), self.groups.iter().map(of_group).chain(by_share))
     }
 
-    /// The same by every number that changes.
-    fn of_changes(&self, column: usize) -> DMatrix<f64> {
-        let of_hold = |(counts, hold): &(f64, OfHold)| hold.column(self.pieces.get(column), self.rows) * *counts;
-        self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something")
+    /// How far a step of the unknowns moves all elements.
+    pub fn forward(&self, step: &DVector<f64>) -> DMatrix<f64> {
+        let mut changes = DVector::zeros(self.holds[0].1.factors.count());
+        for (group, step) in self.groups.iter().zip(step) {
+            group.iter().for_each(|&(number, share)| changes[number] += share * step);
+        }
+        let of_hold = |(counts, hold): &(f64, OfHold)| hold.forward(&self.pieces, &changes) * *counts;
+        let moved = self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something");
+        self.by_share.iter().fold(moved, |moved, by_share| moved + by_share * step[self.groups.len()])
     }
 }
 
 impl OfHold {
-    /// The column of a corrector's pieces, or the last one.
-    fn column(&self, pieces: Option<&Vec<usize>>, rows: usize) -> DMatrix<f64> {
-        let Some(pieces) = pieces else { return self.dispersion.clone().expect("the last column was measured") };
-        let mut made = DMatrix::zeros(rows, self.factors.count());
-        for (gradient, mut into) in made.column_iter_mut().enumerate() {
-            pieces.iter().for_each(|&piece| self.factors.add(piece, gradient, into.as_mut_slice()));
+    /// The derivatives of some columns in turn: those of correctors' pieces, and the last one.
+    fn columns(&self, pieces: &[Vec<usize>], columns: &[usize], rows: usize) -> DMatrix<f64> {
+        let orbits: Vec<&[usize]> =
+            columns.iter().filter_map(|&column| pieces.get(column).map(Vec::as_slice)).collect();
+        let (kicked, all) = (orbits.len() * rows, columns.len() * rows);
+        let mut made = DMatrix::zeros(all, self.factors.count());
+        for (gradient, column) in made.as_mut_slice().chunks_exact_mut(all).enumerate() {
+            self.factors.orbits(&orbits, gradient, &mut column[..kicked]);
+        }
+        if let Some(dispersion) = self.dispersion.as_ref().filter(|_| kicked < all) {
+            made.rows_mut(kicked, rows).copy_from(dispersion);
         }
         made
     }
 
     fn back(&self, pieces: &[Vec<usize>], weights: &DMatrix<f64>) -> DVector<f64> {
-        let corrector = (0..pieces.len()).flat_map(|column| pieces[column].iter().map(move |_| column));
-        let back = self.factors.back(&weights.select_columns(&corrector.collect::<Vec<_>>()));
+        let back = self.factors.back(&slices(pieces), &weights.columns_range(..pieces.len()));
         let last = weights.columns_range(pieces.len()..);
         self.dispersion.iter().fold(back, |back, dispersion| back + dispersion.tr_mul(&last).column(0))
     }
+
+    fn forward(&self, pieces: &[Vec<usize>], step: &DVector<f64>) -> DMatrix<f64> {
+        let moved = self.factors.forward(&slices(pieces), step);
+        let Some(dispersion) = &self.dispersion else { return moved };
+        let mut moved = moved.insert_column(pieces.len(), 0.0);
+        moved.set_column(pieces.len(), &(dispersion * step));
+        moved
+    }
+}
+
+fn slices(pieces: &[Vec<usize>]) -> Vec<&[usize]> {
+    pieces.iter().map(Vec::as_slice).collect()
 }
 
 fn gradient(optics: &Optics, element: usize, change: Change) -> Gradient {

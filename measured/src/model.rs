@@ -337,7 +337,7 @@ mod tests {
     /// The derivative of the whole matrix by one unknown of the machine.
     fn by_one(at: &Prediction, unknown: usize) -> DMatrix<f64> {
         let columns: Vec<_> =
-            (0..at.matrix.ncols()).map(|j| at.by_machine.column(j).column(unknown).into_owned()).collect();
+            (0..at.matrix.ncols()).map(|j| at.by_machine.columns(&[j]).column(unknown).into_owned()).collect();
         DMatrix::from_columns(&columns)
     }
 

@@ -4,7 +4,7 @@
 
 use core::ops::AddAssign;
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{Const, DMatrix, DMatrixView, DVector, Dyn};
 
 use crate::error::MeasuredError;
 use crate::linear::{add_square, in_lanes, inverse, product};
@@ -86,18 +86,12 @@ impl Places {
 
     /// `J` times a step of the unknowns.
     pub fn forward(&self, at: &Prediction, step: &DVector<f64>) -> DMatrix<f64> {
-        let of_machine = step.rows(0, self.machine);
-        let lanes = in_lanes(&every(at.matrix.ncols()), at.matrix.len() * self.machine, |columns| {
-            let moved = |&column: &usize| {
-                let mut sum = at.by_machine.column(column) * of_machine;
-                for (row, sum) in sum.iter_mut().enumerate() {
-                    *sum += self.instruments(at, row, column).map(|(one, by)| by * step[one]).sum::<f64>();
-                }
-                sum
-            };
-            columns.iter().map(moved).collect::<Vec<_>>()
-        });
-        DMatrix::from_columns(&lanes.concat())
+        let mut moved = at.by_machine.forward(&step.rows(0, self.machine).into_owned());
+        for (row, column) in (0..moved.ncols()).flat_map(|column| (0..at.matrix.nrows()).map(move |row| (row, column)))
+        {
+            moved[(row, column)] += self.instruments(at, row, column).map(|(one, by)| by * step[one]).sum::<f64>();
+        }
+        moved
     }
 
     /// `J C J^T` of each element by itself: the variance that a covariance of the unknowns gives it.
@@ -118,7 +112,7 @@ impl Places {
         column: usize,
         (covariance, of_machine): (&DMatrix<f64>, &DMatrix<f64>),
     ) -> DVector<f64> {
-        let by_machine = at.by_machine.column(column);
+        let by_machine = at.by_machine.columns(&[column]);
         let mut spread = product(&by_machine, of_machine);
         let mut variance = DVector::zeros(by_machine.nrows());
         let each: Vec<Vec<_>> =
@@ -142,6 +136,9 @@ impl Places {
 fn every(count: usize) -> Vec<usize> {
     (0..count).collect()
 }
+
+/// Derivatives of the elements of one column, among those of others.
+type Said<'d> = DMatrixView<'d, f64, Const<1>, Dyn>;
 
 /// What some columns say of the machine.
 struct OfMachine {
@@ -210,7 +207,7 @@ impl Normal {
 }
 
 /// Elements whose derivatives are multiplied at once: fewer leave the processor waiting for memory.
-const DEEP: usize = 512;
+const DEEP: usize = 2048;
 
 impl OfMachine {
     fn of_columns(
@@ -222,21 +219,22 @@ impl OfMachine {
     ) -> Self {
         let machine = places.machine;
         let mut sum = Self { left: DMatrix::zeros(unknowns, machine), slope: DVector::zeros(machine) };
-        let mut of_monitors = [0, 1].map(|_| DMatrix::zeros(at.matrix.nrows(), machine));
-        for columns in columns.chunks(DEEP.div_ceil(rows.len())) {
+        let every = at.matrix.nrows();
+        let mut of_monitors = [0, 1].map(|_| DMatrix::zeros(every, machine));
+        for columns in columns.chunks(DEEP.div_ceil(every)) {
+            let by_machine = at.by_machine.columns(columns);
             let depth = rows.len() * columns.len();
             let mut deep = DMatrix::zeros(depth, machine);
             for (number, &column) in columns.iter().enumerate() {
-                let by_machine = at.by_machine.column(column);
-                let mut weights = DVector::zeros(by_machine.nrows());
+                let by_machine = by_machine.rows(number * every, every);
+                let mut weights = DVector::zeros(every);
                 rows.iter().for_each(|&row| weights[row] = data.1[(row, column)]);
                 sum.add_column(places, at, (data.0, &weights), column, &by_machine);
                 for (sum, by_monitor) in of_monitors.iter_mut().zip(&at.by_monitor) {
                     add_times(&by_machine, &weights.component_mul(&by_monitor.column(column)), sum);
                 }
                 let roots: Vec<(usize, f64)> = rows.iter().map(|&row| (row, weights[row].sqrt())).collect();
-                let lines = deep.as_mut_slice().chunks_exact_mut(depth);
-                for (line, by) in lines.zip(by_machine.as_slice().chunks_exact(by_machine.nrows())) {
+                for (line, by) in deep.as_mut_slice().chunks_exact_mut(depth).zip(by_machine.column_iter()) {
                     let line = &mut line[number * rows.len()..];
                     line.iter_mut().zip(&roots).for_each(|(into, &(row, root))| *into = by[row] * root);
                 }
@@ -260,7 +258,7 @@ impl OfMachine {
         at: &Prediction,
         (residual, weights): (&DMatrix<f64>, &DVector<f64>),
         column: usize,
-        by_machine: &DMatrix<f64>,
+        by_machine: &Said,
     ) {
         self.slope.gemv_tr(1.0, by_machine, &weights.component_mul(&residual.column(column)), 1.0);
         for (place, by) in places.columns[column].iter().zip(&at.by_corrector) {
@@ -272,10 +270,9 @@ impl OfMachine {
 }
 
 /// Add the columns of a matrix, each row times its weight.
-fn add_times(matrix: &DMatrix<f64>, weights: &DVector<f64>, sum: &mut DMatrix<f64>) {
-    let columns = matrix.as_slice().chunks_exact(weights.len());
-    for (sum, column) in sum.as_mut_slice().chunks_exact_mut(weights.len()).zip(columns) {
-        sum.iter_mut().zip(column).zip(weights.as_slice()).for_each(|((sum, one), weight)| *sum += one * weight);
+fn add_times(matrix: &Said, weights: &DVector<f64>, sum: &mut DMatrix<f64>) {
+    for (sum, column) in sum.as_mut_slice().chunks_exact_mut(weights.len()).zip(matrix.column_iter()) {
+        sum.iter_mut().zip(&column).zip(weights.as_slice()).for_each(|((sum, one), weight)| *sum += one * weight);
     }
 }
 

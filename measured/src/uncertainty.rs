@@ -136,7 +136,7 @@ fn together(places: &Places, at: &Prediction, slope: &DMatrix<f64>, unknowns: us
     let (rows, columns) = slope.shape();
     let mut together = DMatrix::zeros(unknowns, rows + columns);
     for column in 0..columns {
-        let mut said = at.by_machine.column(column);
+        let mut said = at.by_machine.columns(&[column]);
         for (unknown, mut said) in said.column_iter_mut().enumerate() {
             said.component_mul_assign(&slope.column(column));
             together[(unknown, rows + column)] = said.sum();

@@ -300,7 +300,7 @@ fn of_instrument(folder: &Folder, fitted: &Fit, at: &Prediction, side: Side, one
         Side::Correctors => &at.by_corrector,
     };
     let scale = |&(i, j): &(usize, usize)| {
-        let by_machine = at.by_machine.column(j).row(i).transpose();
+        let by_machine = at.by_machine.columns(&[j]).row(i).transpose();
         let of_magnets = fitted.uncertainty.variance(&by_machine.resize_vertically(fitted.values.len(), 0.0));
         let missed = fitted.noise.blocks[fitted.data.block[(i, j)]];
         ((fitted.noise.monitors[i] * missed.spread(folder.monitors[i].sigma)).hypot(of_magnets.sqrt()), missed.freedom)

@@ -6,7 +6,7 @@
 //!
 //! as in [`Optics::response_jacobian`], whose matrices these are.
 
-use nalgebra::{DMatrix, DVector, Matrix6, RowVector6, Vector6};
+use nalgebra::{DMatrix, DMatrixView, DMatrixViewMut, DVector, Matrix6, Matrix6xX, RowVector6, Vector6};
 
 use crate::response::{Gradient, Observer, Optics, Place, Source, seen_rows};
 
@@ -54,57 +54,78 @@ impl ResponseFactors {
         self.gradients.len()
     }
 
-    /// Add the derivative of a source's orbit at all observers by a gradient.
-    pub fn add(&self, source: usize, gradient: usize, into: &mut [f64]) {
-        let (sent, within) = self.sent(source, gradient);
-        // slices of one length: the loop is over four or eight observers at once
-        let rows = into.len();
-        let column = |number: usize| &self.seen.as_slice()[(6 * gradient + number) * self.seen.nrows()..][..rows];
-        let [x, px, y, py, delta, path] = core::array::from_fn(column);
-        let [to_x, to_px, to_y, to_py, to_delta, to_path] = (*sent).into();
-        for i in 0..rows {
-            let [a, b] = [x[i] * to_x + px[i] * to_px, y[i] * to_y + py[i] * to_py];
-            into[i] += a + b + (delta[i] * to_delta + path[i] * to_path);
+    /// Derivatives of some orbits by a gradient, of all observers in turn for each orbit; an orbit may have several sources.
+    pub fn orbits(&self, orbits: &[&[usize]], gradient: usize, into: &mut [f64]) {
+        let mut sent = Matrix6xX::zeros(orbits.len());
+        for (mut sent, sources) in sent.column_iter_mut().zip(orbits) {
+            sent.copy_from(&self.sent_by(sources, gradient));
         }
-        if let Some(within) = within {
-            let within = self.seen_of_within(gradient, within);
-            into.iter_mut().zip(within).for_each(|(into, within)| *into -= within);
+        let mut into = DMatrixViewMut::from_slice(into, self.observers.len(), orbits.len());
+        into.gemm(1.0, &self.seen.columns(6 * gradient, 6), &sent, 0.0);
+        for (mut orbit, sources) in into.column_iter_mut().zip(orbits) {
+            for within in sources.iter().filter_map(|&source| self.within(source, gradient)) {
+                orbit.iter_mut().zip(within).for_each(|(orbit, within)| *orbit -= within);
+            }
         }
     }
 
-    /// `sum_ij w_ij dG_ij/dk` of each gradient `k`, with weights of all observers, the rows, and sources, the columns: one product, without a derivative.
-    pub fn back(&self, weights: &DMatrix<f64>) -> DVector<f64> {
+    /// `sum_ij w_ij dG_ij/dk` of each gradient `k`, with weights of all observers, the rows, and orbits, the columns: one product, without a derivative.
+    pub fn back(&self, orbits: &[&[usize]], weights: &DMatrixView<f64>) -> DVector<f64> {
         let through = weights.transpose() * &self.seen;
         DVector::from_fn(self.count(), |gradient, _| {
-            let said = |source: usize| {
-                let (sent, within) = self.sent(source, gradient);
-                let left = within.map_or(0.0, |within| {
-                    let weights = weights.column(source);
-                    self.seen_of_within(gradient, within).zip(&weights).map(|(within, weight)| within * weight).sum()
-                });
-                (through.fixed_view::<1, 6>(source, 6 * gradient) * sent)[0] - left
+            let said = |(orbit, sources): (usize, &&[usize])| {
+                let weights = weights.column(orbit);
+                let within = sources.iter().filter_map(|&source| self.within(source, gradient));
+                let within = within.flat_map(|within| within.zip(&weights)).map(|(within, weight)| within * weight);
+                let within: f64 = within.sum();
+                (through.fixed_view::<1, 6>(orbit, 6 * gradient) * self.sent_by(sources, gradient))[0] - within
             };
-            (0..self.sources.len()).map(said).sum()
+            orbits.iter().enumerate().map(said).sum()
         })
     }
 
-    /// What a source sends to a gradient, and what of it is counted within the gradient's element if the source is there.
-    fn sent(&self, source: usize, gradient: usize) -> (&Vector6<f64>, Option<Vector6<f64>>) {
-        let (source, [near, far]) = &self.sources[source];
-        let gradient = &self.gradients[gradient];
-        let within = gradient.within(source);
-        (if within.is_none() && source.place <= gradient.place { far } else { near }, within)
+    /// `sum_k dG_ij/dk t_k` of all observers, the rows, and orbits, the columns, with a step of each gradient: one product, without a derivative.
+    pub fn forward(&self, orbits: &[&[usize]], step: &DVector<f64>) -> DMatrix<f64> {
+        let mut sent = DMatrix::zeros(self.seen.ncols(), orbits.len());
+        for (orbit, gradient) in
+            (0..orbits.len()).flat_map(|orbit| (0..step.len()).map(move |gradient| (orbit, gradient)))
+        {
+            let one = self.sent_by(orbits[orbit], gradient) * step[gradient];
+            sent.fixed_view_mut::<6, 1>(6 * gradient, orbit).copy_from(&one);
+        }
+        let mut moved = &self.seen * sent;
+        for (mut orbit, sources) in moved.column_iter_mut().zip(orbits) {
+            for (gradient, step) in step.iter().enumerate() {
+                for within in sources.iter().filter_map(|&source| self.within(source, gradient)) {
+                    orbit.iter_mut().zip(within).for_each(|(orbit, within)| *orbit -= within * step);
+                }
+            }
+        }
+        moved
     }
 
-    fn seen_of_within(&self, gradient: usize, within: Vector6<f64>) -> impl Iterator<Item = f64> {
-        let before = self.gradients[gradient].place;
-        self.observers.iter().map(move |(place, rows)| (rows[usize::from(before < *place)] * within)[0])
+    /// What some sources send to a gradient.
+    fn sent_by(&self, sources: &[usize], gradient: usize) -> Vector6<f64> {
+        let gradient = &self.gradients[gradient];
+        let sent = |&source: &usize| {
+            let (source, [near, far]) = &self.sources[source];
+            let is_before = gradient.within(source).is_none() && source.place <= gradient.place;
+            if is_before { far } else { near }
+        };
+        sources.iter().map(sent).sum()
+    }
+
+    /// What all observers see of a source in a gradient's own element, none if it is not there.
+    fn within(&self, source: usize, gradient: usize) -> Option<impl Iterator<Item = f64>> {
+        let gradient = &self.gradients[gradient];
+        let within = gradient.within(&self.sources[source].0)?;
+        Some(self.observers.iter().map(move |(place, rows)| (rows[usize::from(gradient.place < *place)] * within)[0]))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::DMatrix;
+    use nalgebra::{DMatrix, DVector};
 
     use crate::{Hold, Optics, Plane, Ring};
 
@@ -122,14 +143,26 @@ mod tests {
         for (gradient, matrix) in matrices.iter().enumerate() {
             for (source, exact) in matrix.column_iter().enumerate() {
                 let mut made = vec![0.0; observers.len()];
-                factors.add(source, gradient, &mut made);
+                factors.orbits(&[&[source]], gradient, &mut made);
                 let off = made.iter().zip(&exact).map(|(made, exact)| (made - exact).abs()).fold(0.0, f64::max);
                 assert!(off < 1e-12 * matrix.amax(), "{gradient} {source}: {off}");
             }
         }
-        let weights = DMatrix::from_fn(observers.len(), sources.len(), |i, j| (1.0 + (3 * i + 7 * j) as f64).sin());
-        for (back, matrix) in factors.back(&weights).iter().zip(&matrices) {
-            assert!((back - weights.dot(matrix)).abs() < 1e-12 * matrix.norm(), "rounding");
+        // an orbit of two sources
+        let orbits: Vec<Vec<usize>> = (0..sources.len() - 1).map(|first| vec![first, first + 1]).collect();
+        let orbits: Vec<&[usize]> = orbits.iter().map(Vec::as_slice).collect();
+        let weights = DMatrix::from_fn(observers.len(), orbits.len(), |i, j| (1.0 + (3 * i + 7 * j) as f64).sin());
+        let back = factors.back(&orbits, &weights.as_view());
+        let step = DVector::from_fn(gradients.len(), |i, _| (1.0 + i as f64).cos());
+        let mut moved = factors.forward(&orbits, &step);
+        for (gradient, matrix) in matrices.iter().enumerate() {
+            let exact = matrix.columns_range(..orbits.len()) + matrix.columns_range(1..);
+            let mut made = DMatrix::zeros(observers.len(), orbits.len());
+            factors.orbits(&orbits, gradient, made.as_mut_slice());
+            assert!((made - &exact).amax() < 1e-12 * matrix.amax(), "{gradient}: rounding");
+            assert!((back[gradient] - weights.dot(&exact)).abs() < 1e-12 * matrix.norm(), "{gradient}: rounding");
+            moved -= exact * step[gradient];
         }
+        assert!(moved.amax() < 1e-11 * matrices.iter().map(|one| one.amax()).fold(0.0, f64::max), "rounding");
     }
 }
