@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 
 use estimator::{Health, MonitorState};
 use inference::Excluded;
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DMatrixViewMut, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine};
 
 use super::data::{Data, DataError, following};
@@ -138,19 +138,18 @@ impl Data {
         Ok(all)
     }
 
-    /// The same of several columns, of which those that are not given are 0.
+    /// The same of several columns; `fill` fills the rows of one recording, which are 0.
     ///
     /// # Errors
-    /// Those of `of`.
+    /// Those of `fill`.
     pub(crate) fn stacked_columns<E>(
         &self,
         columns: usize,
-        of: impl Fn(usize, &Self) -> Result<DMatrix<f64>, E>,
+        fill: impl Fn(usize, &Self, DMatrixViewMut<f64>) -> Result<(), E>,
     ) -> Result<DMatrix<f64>, E> {
         let mut all = DMatrix::zeros(self.whole_size(), columns);
         for ((index, one), rows) in self.campaigns().enumerate().zip(self.parts()) {
-            let of_one = of(index, one)?;
-            all.view_range_mut(rows, ..of_one.ncols()).copy_from(&of_one);
+            fill(index, one, all.rows_range_mut(rows))?;
         }
         Ok(all)
     }
