@@ -292,14 +292,6 @@ impl Fitted {
         (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
 
-    /// The machine in each recording, and its drives.
-    ///
-    /// # Errors
-    /// [`EffectError`].
-    pub fn machines(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
-        (0..data.count()).map(|campaign| self.machine_in(data, campaign)).collect()
-    }
-
     /// Change of the tunes by the unknown element, which is not in the machine; 0 without one.
     ///
     /// # Errors
