@@ -6,7 +6,7 @@
 //!
 //! Source: A. C. Davison and D. V. Hinkley, Bootstrap Methods and their Application (1997), ch. 4.2, eq. 4.11.
 
-use evidence::Factor;
+use evidence::{Factor, symmetric};
 use nalgebra::{DMatrix, DVectorView};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -31,7 +31,7 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
     let best =
         |scores: &mut dyn Iterator<Item = SignatureScore>| choice.log_weights(scores).fold(f64::NEG_INFINITY, f64::max);
     let best_score = best(&mut scores());
-    let mut covariance = choice.columns.transpose() * &choice.left;
+    let mut covariance = symmetric(&choice.columns, &choice.left);
     // alike signatures leave no more than rounding between them; one of an instrument that is dead is zero
     (0..covariance.nrows()).for_each(|i| covariance[(i, i)] += ROUNDING * (1.0 + covariance[(i, i)]));
     let factor = Factor::of(covariance).ok_or(FitError::Degenerate)?;

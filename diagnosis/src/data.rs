@@ -19,7 +19,7 @@
 use core::ops::Range;
 
 use estimator::{Health, MonitorState};
-use nalgebra::{DMatrix, DVector, DVectorViewMut, MatrixXx2, RowVector2};
+use nalgebra::{DMatrix, DMatrixViewMut, DVector, DVectorViewMut, MatrixXx2, RowVector2};
 use twin::{
     Drives, EffectError, Hold, Holding, Kind, Machine, Measured, Optics, OrbitError, Rf, Ring, Signature, Signatures,
     change_at,
@@ -598,27 +598,26 @@ impl Data {
         self.whiten(|c, pool| self.effect_on(signature, c, pool))
     }
 
-    /// Several signatures, whitened, one a column; 0 for none. All columns of a channel at once are several times as fast as one by one.
+    /// Several signatures, whitened, one a column; columns of none stay 0. All columns of a channel at once are several times as fast as one by one.
     ///
     /// # Errors
     /// The first among the signatures.
     pub(crate) fn signatures<E>(
         &self,
-        count: usize,
+        mut into: DMatrixViewMut<f64>,
         signatures: impl Iterator<Item = Result<Option<Signature>, E>>,
-    ) -> Result<DMatrix<f64>, E> {
-        let mut all = DMatrix::zeros(self.size(), count);
-        for (mut column, signature) in all.column_iter_mut().zip(signatures) {
+    ) -> Result<(), E> {
+        for (mut column, signature) in into.column_iter_mut().zip(signatures) {
             if let Some(signature) = signature? {
                 self.stack(&mut column, |c, pool| self.effect_on(&signature, c, pool));
             }
         }
-        self.whiten_stacked(&mut all);
-        Ok(all)
+        self.whiten_stacked(into);
+        Ok(())
     }
 
     /// Whiten stacked columns.
-    fn whiten_stacked(&self, all: &mut DMatrix<f64>) {
+    fn whiten_stacked(&self, mut all: DMatrixViewMut<f64>) {
         for (channel, rows) in self.channels.iter().zip(self.rows_of_channels()) {
             channel.whiten_mut(all.rows_range_mut(rows));
         }
@@ -787,7 +786,7 @@ impl Data {
         for (mut column, (signature, step)) in all.column_iter_mut().zip(each) {
             self.stack(&mut column, |c, pool| self.effect_on(signature, c, pool) * step[pool]);
         }
-        self.whiten_stacked(&mut all);
+        self.whiten_stacked(all.as_view_mut());
         all
     }
 

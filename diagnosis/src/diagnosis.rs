@@ -98,7 +98,7 @@ impl Diagnosis {
         let bare = if found.has_more() { heldout::bare(data, &found.best)? } else { found.null.clone() };
         let before = Score::from_blocks(data, &bare, &blocks)?;
         let after = if found.has_more() { Score::from_blocks(data, &found.best, &blocks)? } else { before.clone() };
-        let tests = verdict::tests(data, &found, &candidates, &before, &after, &blocks)?;
+        let tests = verdict::tests(data, &found, &candidates, (&bare, &before), &after, &blocks)?;
         let of_means = Verdict::from_tests(&found, &tests);
         let verdict = of_means.with_transients(&transients).with_noise(data);
         let of_element = verdict::test_of_element(data, &found, &before, &after, &blocks)?;

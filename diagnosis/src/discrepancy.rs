@@ -110,7 +110,8 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     for q in 0..data.ring.quadrupoles.len() {
         let forms = Element::signatures(&signatures, &data.ring, q);
         let of_rms_1 = |(_, one): &(Form, Signature)| Ok(Some(at_monitors(one, &active) * one.rms().recip()));
-        let columns = data.signatures::<FitError>(forms.len(), forms.iter().map(of_rms_1))?;
+        let mut columns = DMatrix::zeros(data.size(), forms.len());
+        data.signatures::<FitError>(columns.as_view_mut(), forms.iter().map(of_rms_1))?;
         let of_all = Sums::from_columns(&columns, &whitened);
         for does in Linear::ALL {
             let some: Vec<usize> = (0..forms.len()).filter(|&i| does.has(forms[i].0)).collect();
@@ -190,9 +191,7 @@ fn weighted(data: &Data, sums: &[Sums], monitors: &[usize], pattern: &DVector<f6
     let all = data.accompanied(monitors, pattern);
     let mut sum = Sums::zero(first.cross.nrows(), first.cross.ncols());
     for &b in monitors.iter().filter(|&&b| pattern[b] != 0.0) {
-        sum.gram += &sums[b].gram * (pattern[b] * all[b]);
-        sum.cross += &sums[b].cross * pattern[b];
-        sum.pull += &sums[b].pull * pattern[b];
+        sum.add(&sums[b], pattern[b], all[b]);
     }
     sum
 }

@@ -292,14 +292,6 @@ impl Fitted {
         (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
 
-    /// The machine in each recording, and its drives.
-    ///
-    /// # Errors
-    /// [`EffectError`].
-    pub fn machines(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
-        (0..data.count()).map(|campaign| self.machine_in(data, campaign)).collect()
-    }
-
     /// Change of the tunes by the unknown element, which is not in the machine; 0 without one.
     ///
     /// # Errors
@@ -439,7 +431,7 @@ impl<'d> Problem<'d> {
         let (data, vars) = (self.data, self.data.units.len());
         let held = self.held(u);
         let sigma = self.hypothesis.units(data).sigma;
-        let mut jacobian = data.stacked_columns(self.others(), |campaign, own| {
+        let mut jacobian = data.stacked_columns(self.others(), |campaign, own, into| {
             let (machine, drives) = machine_at(data, self.hypothesis, campaign, &held)?;
             let machine = machine.on_orbit(&drives.orbit);
             let ends = machine.ends();
@@ -449,7 +441,7 @@ impl<'d> Problem<'d> {
             let of_others = self.unknowns[..self.others() - vars].iter();
             let of_others = of_others.zip(u.iter().skip(vars));
             let of_others = of_others.map(|(unknown, u)| of_linear(data, campaign, &signatures, unknown, *u));
-            own.signatures::<EffectError>(self.others(), of_vars.chain(of_others))
+            own.signatures(into, of_vars.chain(of_others))
         })?;
         let is_exact = |i: &usize| matches!(self.unknowns[i - vars], Unknown::Amplitude(..) | Unknown::Orbit(..));
         for i in (vars..self.others()).filter(is_exact) {
@@ -472,13 +464,13 @@ impl Ordinary {
         start: &DVector<f64>,
         machine: impl Fn(usize) -> Result<(Machine, Drives), EffectError>,
     ) -> Result<Self, EffectError> {
-        let slopes = data.stacked_columns(unknowns.len(), |campaign, own| {
+        let slopes = data.stacked_columns(unknowns.len(), |campaign, own, into| {
             let (machine, drives) = machine(campaign)?;
             let machine = machine.on_orbit(&drives.orbit);
             let ends = machine.ends();
             let signatures = Signatures::of(&machine, &drives)?.between(ends.as_ref())?;
             let prediction = |(unknown, u): (&Unknown, &f64)| of_linear(data, campaign, &signatures, unknown, *u);
-            own.signatures::<EffectError>(unknowns.len(), unknowns.iter().zip(start).map(prediction))
+            own.signatures(into, unknowns.iter().zip(start).map(prediction))
         })?;
         let gram = gram(&slopes);
         Ok(Self { slopes, gram })

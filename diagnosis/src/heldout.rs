@@ -18,7 +18,7 @@
 //! Comput. 13 (2001) 1103, eq. 10, what is left out of a Gaussian process.
 
 use estimator::MonitorState;
-use evidence::Factor;
+use evidence::{Factor, gram};
 use inference::Settings;
 use nalgebra::{DMatrix, DVector};
 
@@ -194,7 +194,7 @@ impl<'d> Precision<'d> {
             column.tr_copy_from(&self.channels[c].cross.row(row));
         }
         let taken = self.fitted.factor.whiten(&cross);
-        let mut precision = -(taken.transpose() * taken);
+        let mut precision = -gram(&taken);
         for (i, &(c, row)) in readings.iter().enumerate() {
             for (j, &(_, other)) in readings.iter().enumerate().filter(|(_, (of, _))| *of == c) {
                 precision[(i, j)] += self.channels[c].gram[(row, other)];

@@ -12,10 +12,11 @@ use std::collections::BTreeMap;
 
 use estimator::{Health, MonitorState};
 use inference::Excluded;
-use nalgebra::{DMatrix, DVector};
-use twin::{Drives, EffectError, EffectKind, Machine};
+use nalgebra::{DMatrix, DMatrixViewMut, DVector};
+use twin::{EffectError, EffectKind};
 
 use super::data::{Data, DataError, following};
+use super::fit::Fitted;
 
 /// Momentum of a particle of one elementary charge over its rigidity [GeV/c per T m].
 const PER_RIGIDITY: f64 = 0.299_792_458;
@@ -138,19 +139,18 @@ impl Data {
         Ok(all)
     }
 
-    /// The same of several columns, of which those that are not given are 0.
+    /// The same of several columns; `fill` fills the rows of one recording, which are 0.
     ///
     /// # Errors
-    /// Those of `of`.
+    /// Those of `fill`.
     pub(crate) fn stacked_columns<E>(
         &self,
         columns: usize,
-        of: impl Fn(usize, &Self) -> Result<DMatrix<f64>, E>,
+        fill: impl Fn(usize, &Self, DMatrixViewMut<f64>) -> Result<(), E>,
     ) -> Result<DMatrix<f64>, E> {
         let mut all = DMatrix::zeros(self.whole_size(), columns);
         for ((index, one), rows) in self.campaigns().enumerate().zip(self.parts()) {
-            let of_one = of(index, one)?;
-            all.view_range_mut(rows, ..of_one.ncols()).copy_from(&of_one);
+            fill(index, one, all.rows_range_mut(rows))?;
         }
         Ok(all)
     }
@@ -160,19 +160,17 @@ impl Data {
         self.campaigns().map(Self::log_det).sum()
     }
 
-    /// [`Data::linearise_about`] of each recording about its machine and orbit; chi-square of the change of all readings.
+    /// [`Data::linearise_about`] of each recording about the machine and orbit of a fit; chi-square of the change of all readings.
     ///
     /// # Errors
     /// [`EffectError`]; all are then as they were.
-    pub(crate) fn linearise_each(&mut self, machines: &[(Machine, Drives)]) -> Result<f64, EffectError> {
-        let mut others = self.others.clone();
-        let mut moved = 0.0;
-        for (other, (machine, drives)) in others.iter_mut().zip(&machines[1..]) {
-            moved += other.linearise_about(machine, &drives.orbit)?;
+    pub(crate) fn linearise_each(&mut self, fitted: &Fitted) -> Result<f64, EffectError> {
+        let (mut linearised, mut moved) = (self.clone(), 0.0);
+        for campaign in 0..self.count() {
+            let (machine, drives) = fitted.machine_in(self, campaign)?;
+            moved += linearised.campaign_mut(campaign).linearise_about(&machine, &drives.orbit)?;
         }
-        let (machine, drives) = &machines[0];
-        moved += self.linearise_about(machine, &drives.orbit)?;
-        self.others = others;
+        *self = linearised;
         Ok(moved)
     }
 
@@ -195,7 +193,6 @@ mod tests {
     use twin::{Effect, Ring};
 
     use super::*;
-    use crate::fit::Fitted;
     use crate::hypothesis::Hypothesis;
     use crate::scan::signatures;
     use crate::term::Term;

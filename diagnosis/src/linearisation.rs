@@ -27,7 +27,7 @@ pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
     for _ in 0..PASSES {
         let mut linearised = data.clone();
         // a machine that keeps no beam in one of the settings is not the one that was recorded
-        let Ok(moved) = linearised.linearise_each(&fitted.machines(data)?) else { break };
+        let Ok(moved) = linearised.linearise_each(&fitted) else { break };
         let Ok(again) = Fitted::from_guess(&linearised, hypothesis, &fitted.u) else { break };
         // nor is one that is far off, whose exact orbits may be metres: each pass then goes further away
         if again.is_poor() && again.cost > fitted.cost {
@@ -57,12 +57,11 @@ fn trimmed(data: &Data, fitted: &Fitted) -> Option<(Data, Fitted)> {
 /// A fit to readings that were linearised about a machine with further effects: the same to readings of its own, where these differ.
 pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
     let mut relinearised = fitted.data(data).clone();
-    let linearise = |data: &mut Data, fitted: &Fitted| data.linearise_each(&fitted.machines(data)?);
     for pass in 0..PASSES {
         if fitted.is_poor() {
             break;
         }
-        let Ok(moved) = linearise(&mut relinearised, &fitted) else { break };
+        let Ok(moved) = relinearised.linearise_each(&fitted) else { break };
         if pass == 0 && moved < CURVED {
             break;
         }
@@ -100,7 +99,7 @@ mod tests {
         let fitted = fit(&mut data, &hypothesis, &DVector::zeros(unknowns)).unwrap();
         let (value, sigma) = fitted.amplitude(&data, 0);
         assert!(((value - sextupole.amplitude) / sigma).abs() < 3.0, "{value} ± {sigma}");
-        let again = data.linearise_each(&fitted.machines(&data).unwrap()).unwrap();
+        let again = data.linearise_each(&fitted).unwrap();
         assert!(again < CURVED && fitted.chi2_per_number() < 0.9, "{again} {}", fitted.chi2_per_number());
     }
 

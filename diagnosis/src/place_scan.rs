@@ -70,10 +70,10 @@ impl PlaceScan {
         let of_kind = left_out.map_or_else(|| kind.kind(), |term| fitted.hypothesis.terms[term].kind);
         let judge = |segments: Vec<Segment>| -> Self {
             let of_batch = |batch: &[Segment]| {
-                let columns = data.stacked_columns(batch.len(), |campaign, own| {
+                let columns = data.stacked_columns(batch.len(), |campaign, own, into| {
                     let scale = scale * data.scale(campaign, of_kind);
                     let signature = |at: &Segment| Ok(Some(signatures[campaign].of_thin(at.place, kind) * scale));
-                    own.signatures::<Infallible>(batch.len(), batch.iter().map(signature))
+                    own.signatures::<Infallible>(into, batch.iter().map(signature))
                 });
                 let Ok(columns) = columns;
                 projection.score(&columns).scores

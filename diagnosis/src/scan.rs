@@ -9,7 +9,7 @@
 
 use core::convert::Infallible;
 
-use evidence::{Evidence, Factor};
+use evidence::{Evidence, Factor, gram};
 use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{Drives, EffectKind, Machine, Signatures, Site};
 
@@ -130,7 +130,7 @@ impl Projection {
     /// `d_i P d_j` of whitened signatures, one a column.
     pub(crate) fn gram(&self, columns: &DMatrix<f64>) -> DMatrix<f64> {
         let shared = &self.back * columns;
-        columns.transpose() * columns - shared.transpose() * self.factor.solve(&shared)
+        gram(columns) - gram(&self.factor.whiten(&shared))
     }
 
     /// Score whitened signatures, one a column, in units of their prior standard deviations.
@@ -205,13 +205,13 @@ pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatri
 
 /// The same by the signatures of the machine in each recording.
 fn whitened(data: &Data, of_each: &[Signatures], terms: &[Term]) -> DMatrix<f64> {
-    let columns = data.stacked_columns(terms.len(), |campaign, own| {
+    let columns = data.stacked_columns(terms.len(), |campaign, own, into| {
         let signature = |term: &Term| {
             let scale = term.kind.prior_scale().unwrap_or(1.0) * data.scale(campaign, term.kind);
             // none if there is no stable machine with it
             Ok(of_each[campaign].of_effect(term.kind, term.site).ok().map(|one| one * scale))
         };
-        own.signatures::<Infallible>(terms.len(), terms.iter().map(signature))
+        own.signatures::<Infallible>(into, terms.iter().map(signature))
     });
     let Ok(columns) = columns;
     columns

@@ -165,7 +165,7 @@ impl Search {
         let won = (is_alike && again.log_evidence < leader.log_evidence + BETTER).then_some(&found.next);
         let (mut best, competitions) = self.settle(&data, won.map_or(again, |_| leader), won)?;
         // the effects change the orbits' higher orders, so that the readings are linearised about the new machine
-        if data.linearise_each(&best.machines(&data)?).is_ok_and(|moved| moved > CURVED) {
+        if data.linearise_each(&best).is_ok_and(|moved| moved > CURVED) {
             best = linearisation::fit(&mut data, &best.hypothesis, &best.u)?;
             if best.hypothesis.ordinary.is_empty() {
                 best = with_ordinary(&mut data, best);

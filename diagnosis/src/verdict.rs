@@ -11,6 +11,7 @@ use super::data::Data;
 use super::error::FitError;
 use super::experiment::Menu;
 use super::family::family_of;
+use super::fit::Fitted;
 use super::heldout::{Block, Score, gain_of_choice, lessened, reduced};
 use super::imperfection::{Imperfection, POSITION};
 use super::limits::Limits;
@@ -300,7 +301,7 @@ pub fn tests(
     data: &Data,
     found: &Found,
     candidates: &[Term],
-    before: &Score,
+    (bare, before): (&Fitted, &Score),
     after: &Score,
     blocks: &[Block],
 ) -> Result<Vec<Tested>, FitError> {
@@ -311,8 +312,8 @@ pub fn tests(
     let (candidates, penalty) = (&candidates, &penalty);
     let test = |i: usize| -> Result<Tested, FitError> {
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
-        let without = &reduced(data, &found.best, i)?;
         let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
+        let without = &if is_all { bare.clone() } else { reduced(data, &found.best, i)? };
         let rival = if is_all { before } else { &Score::from_blocks(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_poor() {

@@ -16,6 +16,7 @@
 
 use core::fmt;
 
+use evidence::{Factor, gram};
 use nalgebra::{DMatrix, DMatrixView, DVector, Matrix2, Vector2};
 use twin::{EffectError, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring};
 
@@ -454,12 +455,12 @@ impl Regressed {
         columns.column_iter_mut().zip(prior.iter()).for_each(|(mut column, prior)| column *= prior / noise);
         let readings = DVector::from_vec(readings) / noise;
         let readings = readings.add_scalar(-readings.mean());
-        let normal = columns.tr_mul(&columns) + DMatrix::identity(drive.ncols(), drive.ncols());
-        let factor = normal.cholesky().expect("at least 1 everywhere");
+        let normal = gram(&columns) + DMatrix::identity(drive.ncols(), drive.ncols());
+        let factor = Factor::of(normal).expect("at least 1 everywhere");
         let found = factor.solve(&columns.tr_mul(&readings));
         Self {
             response: found.component_mul(prior),
-            variance: factor.inverse().diagonal().component_mul(&square),
+            variance: DVector::from_vec(factor.inverse_diagonal()).component_mul(&square),
             readings: readings.len() as f64,
             left: (&readings - columns * found).norm_squared(),
         }

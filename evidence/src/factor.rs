@@ -1,4 +1,4 @@
-//! The Cholesky factor of a positive matrix, in blocks: the products of blocks, most of the work, are several times as fast as nalgebra's own
+//! The Cholesky factor of a positive matrix, in blocks: the products of blocks, most of the work of large ones, are several times as fast as nalgebra's own
 //! factorisation and solution, which go column by column.
 //!
 //! Source: G. Golub and C. Van Loan, Matrix Computations (2013), ch. 4.2.9, recursive block Cholesky.
@@ -6,10 +6,14 @@
 use nalgebra::allocator::Allocator;
 use nalgebra::{DMatrix, DMatrixView, DMatrixViewMut, DefaultAllocator, Dim, Dyn, Matrix, OMatrix, Storage};
 
-/// Rows that are worked on column by column: fewer than fit a processor's nearest cache.
+/// Rows that are solved column by column, and factorised so.
 const ROWS: usize = 48;
-/// Columns up to which blocks are no gain.
+const FACTORISED: usize = 160;
+/// Columns of a product of which half is left out.
+const COLUMNS: usize = 100;
+/// Columns up to which blocks are no gain, and from which on the inverse of a small block is one.
 const FEW: usize = 3;
+const MANY: usize = 96;
 
 /// `L` of a positive matrix `L L^T`.
 #[derive(Debug, Clone)]
@@ -21,6 +25,9 @@ pub struct Factor {
 impl Factor {
     /// Of a matrix of which the lower triangle is read; none if it is not positive.
     pub fn of(mut matrix: DMatrix<f64>) -> Option<Self> {
+        if matrix.nrows() <= FACTORISED {
+            return Some(Self { lower: matrix.cholesky()?.unpack_dirty() });
+        }
         factorise(matrix.as_view_mut())?;
         Some(Self { lower: matrix })
     }
@@ -75,8 +82,7 @@ impl Factor {
 
     /// The matrix' inverse.
     pub fn inverse(&self) -> DMatrix<f64> {
-        let whitened = self.inverse_lower();
-        whitened.transpose() * whitened
+        gram(&self.inverse_lower())
     }
 
     /// Diagonal of the matrix' inverse.
@@ -98,18 +104,23 @@ pub fn solve_lower_mut(lower: &DMatrix<f64>, right: DMatrixViewMut<f64>) {
     forward(lower.as_view(), right);
 }
 
-/// `A^T A`: half of the products, as it is symmetric.
+/// `A^T A`.
 pub fn gram(columns: &DMatrix<f64>) -> DMatrix<f64> {
+    symmetric(columns, columns)
+}
+
+/// `A^T B` that is symmetric: half of the products.
+pub fn symmetric(columns: &DMatrix<f64>, others: &DMatrix<f64>) -> DMatrix<f64> {
     let back = columns.transpose();
     let mut gram = DMatrix::zeros(columns.ncols(), columns.ncols());
-    lower_gram(back.as_view(), columns.as_view(), gram.as_view_mut());
+    lower_gram(back.as_view(), others.as_view(), gram.as_view_mut());
     gram.fill_upper_triangle_with_lower_triangle();
     gram
 }
 
 fn lower_gram(back: DMatrixView<f64>, columns: DMatrixView<f64>, mut gram: DMatrixViewMut<f64>) {
     let (n, half) = (gram.nrows(), gram.nrows() / 2);
-    if n <= ROWS {
+    if n <= COLUMNS {
         gram.gemm(1.0, &back, &columns, 0.0);
         return;
     }
@@ -134,7 +145,7 @@ where
 /// The lower triangle of `A` becomes that of `L`: with `A` in four blocks, `L11` of `A11`, `L21 = A21 L11^-T`, `L22` of `A22 - L21 L21^T`.
 fn factorise(mut matrix: DMatrixViewMut<f64>) -> Option<()> {
     let n = matrix.nrows();
-    if n <= ROWS {
+    if n <= FACTORISED {
         let factor = matrix.clone_owned().cholesky()?;
         matrix.copy_from(factor.l_dirty());
         return Some(());
@@ -165,11 +176,21 @@ fn invert(lower: DMatrixView<f64>, mut inverse: DMatrixViewMut<f64>) {
     invert(of_rest, inverse.view_mut((half, half), (n - half, n - half)));
 }
 
+/// Solve column by column, or many columns by the product with the inverse.
+fn solve_block(mut right: DMatrixViewMut<f64>, solve: impl Fn(&mut DMatrixViewMut<f64>)) {
+    if right.ncols() < MANY {
+        return solve(&mut right);
+    }
+    let mut inverse = DMatrix::identity(right.nrows(), right.nrows());
+    solve(&mut inverse.as_view_mut());
+    let product = inverse * &right;
+    right.copy_from(&product);
+}
+
 fn forward(lower: DMatrixView<f64>, mut right: DMatrixViewMut<f64>) {
     let n = lower.nrows();
     if n <= ROWS || right.ncols() <= FEW {
-        lower.solve_lower_triangular_unchecked_mut(&mut right);
-        return;
+        return solve_block(right, |columns| lower.solve_lower_triangular_unchecked_mut(columns));
     }
     let half = n / 2;
     let (mut first, mut rest) = right.rows_range_pair_mut(..half, half..);
@@ -182,8 +203,7 @@ fn forward(lower: DMatrixView<f64>, mut right: DMatrixViewMut<f64>) {
 fn backward(lower: DMatrixView<f64>, mut right: DMatrixViewMut<f64>) {
     let n = lower.nrows();
     if n <= ROWS || right.ncols() <= FEW {
-        lower.tr_solve_lower_triangular_unchecked_mut(&mut right);
-        return;
+        return solve_block(right, |columns| lower.tr_solve_lower_triangular_unchecked_mut(columns));
     }
     let half = n / 2;
     let (mut first, mut rest) = right.rows_range_pair_mut(..half, half..);
@@ -205,8 +225,9 @@ mod tests {
 
     #[test]
     fn a_matrix_times_its_solution_is_the_right_side() {
-        for n in [1, ROWS, ROWS + 1, 5 * ROWS + 3] {
-            let (matrix, right) = (positive(n), DMatrix::from_fn(n, 5, |i, j| ((i + 1) * (j + 2)) as f64 % 5.0));
+        for (n, columns) in [(1, 5), (ROWS, 5), (ROWS + 1, 5), (5 * ROWS + 3, 5), (5 * ROWS + 3, MANY)] {
+            let right = DMatrix::from_fn(n, columns, |i, j| ((i + 1) * (j + 2)) as f64 % 5.0);
+            let matrix = positive(n);
             let factor = Factor::of(matrix.clone()).unwrap();
             let near = |one: &DMatrix<f64>, other: &DMatrix<f64>| assert!((one - other).amax() < 1e-11, "{n} rows");
             near(&(&matrix * factor.solve(&right)), &right);
@@ -230,7 +251,7 @@ mod tests {
 
     #[test]
     fn what_is_not_positive_has_no_factor() {
-        let mut matrix = positive(3 * ROWS);
+        let mut matrix = positive(5 * ROWS);
         matrix[(2 * ROWS, 2 * ROWS)] = -1.0;
         assert!(Factor::of(matrix).is_none());
     }

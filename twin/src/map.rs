@@ -91,13 +91,31 @@ impl Element {
 
     /// Linear map about the ray that enters as `z`, which is moved to the exit.
     pub fn linearise(&self, z: &mut Phase<f64>) -> Matrix6<f64> {
-        self.matrix(z, self.length, true).unwrap_or_else(|| derivative(z, |z| self.track(z)))
+        let exact = self.matrix(z, self.length, true).or_else(|| self.pass_free(z, self.length));
+        exact.unwrap_or_else(|| derivative(z, |z| self.track(z)))
     }
 
     /// Linear map from the entrance to `depth` [m] inside, about the ray that enters as `z`.
     pub fn linearise_into(&self, z: &Phase<f64>, depth: f64) -> Matrix6<f64> {
-        let exact = || derivative(&mut z.clone_owned(), |z| self.track_into(z, depth));
-        self.matrix(z, depth, false).unwrap_or_else(exact)
+        let mut z = *z;
+        let exact = self.matrix(&z, depth, false).or_else(|| self.pass_free(&mut z, depth));
+        exact.unwrap_or_else(|| derivative(&mut z, |z| self.track_into(z, depth)))
+    }
+
+    /// Linear map of an element without a field, but for a kick at its entrance, about the ray that enters as `z`, which is moved to `depth` [m]; none of others.
+    fn pass_free(&self, z: &mut Phase<f64>, depth: f64) -> Option<Matrix6<f64>> {
+        let kick = match self.kind {
+            Kind::Drift | Kind::Marker | Kind::Monitor => [0.0; 2],
+            Kind::Corrector { kick } => kick,
+            _ => return None,
+        };
+        if !self.misalignment.is_none() {
+            return None;
+        }
+        (z[PX], z[PY]) = (z[PX] + kick[0], z[PY] + kick[1]);
+        let map = about_drift(z, depth);
+        drift(z, depth);
+        Some(map)
     }
 }
 
@@ -176,6 +194,19 @@ fn drift<T: Scalar>(z: &mut Phase<T>, length: f64) {
     z[X] += px * per_pz;
     z[Y] += py * per_pz;
     z[PATH] += p * per_pz - length;
+}
+
+/// Linear map of a drift about the ray that enters as `z`: with `l = L/pz`, `d(l)/d(px) = px L/pz^3` and `d(l)/d(delta) = -p L/pz^3`.
+fn about_drift(z: &Phase<f64>, length: f64) -> Matrix6<f64> {
+    let (px, py, p) = (z[PX], z[PY], z[DELTA] + 1.0);
+    let per_pz = longitudinal(z, px, py).recip();
+    let (l, cube) = (length * per_pz, length * per_pz.powi(3));
+    let mut map = Matrix6::identity();
+    for (row, slope, own) in [(X, px, PX), (Y, py, PY), (PATH, p, DELTA)] {
+        (map[(row, PX)], map[(row, PY)], map[(row, DELTA)]) = (slope * px * cube, slope * py * cube, -slope * p * cube);
+        map[(row, own)] += l;
+    }
+    map
 }
 
 /// Thin normal quadrupole, skew quadrupole and sextupole: `px -= K1L x`, `px += K1sL y`, `px -= K2L (x^2 - y^2)/2`.
@@ -409,6 +440,17 @@ mod tests {
 
     fn bend(k1: f64, e: f64) -> Element {
         element(Kind::Bend(Bend { curvature: 0.1, k1, k2: 0.0, e1: e, e2: e, fringe: 0.0 }), 0.9)
+    }
+
+    #[test]
+    fn the_map_of_what_is_free_is_the_derivative_of_its_track() {
+        let corrector = element(Kind::Corrector { kick: [2e-3, -1e-3] }, 0.4);
+        for free in [element(Kind::Drift, 1.3), element(Kind::Monitor, 0.0), corrector] {
+            let ray = Phase::from([3e-3, 4e-3, -2e-3, 7e-3, 5e-3, 1e-3]);
+            let (mut one, mut other) = (ray, ray);
+            let off = free.linearise(&mut one) - derivative(&mut other, |z| free.track(z));
+            assert!(off.amax() < 1e-14 && (one - other).amax() < 1e-15, "{:?}: rounding", free.kind);
+        }
     }
 
     #[test]

@@ -72,10 +72,8 @@ pub struct ClosedOrbit {
 /// Newton converges quadratically; from a reference orbit a few millimetres off it takes three or four steps.
 const STEPS: usize = 20;
 
-/// Steps of a chord before Newton's are tried, and those after the residual is small enough: each leaves a tenth or less, so that orbits are
-/// exact to rounding, as Newton's are.
+/// Steps of a chord before Newton's are tried.
 const CHORDS: usize = 14;
-const FURTHER: usize = 2;
 
 /// Largest residual of a closed orbit [m, rad]; the maps round at about 1e-15.
 const TOLERANCE: f64 = 1e-12;
@@ -128,18 +126,15 @@ impl ClosedOrbit {
             start[DELTA] = delta;
         }
         let slope = invert(&hold.closure(ring, start[DELTA], known.one_turn()), known.one_turn())?;
-        let mut further = 0;
         for _ in 0..CHORDS {
             let mut end = start;
             ring.elements.iter().for_each(|element| element.track(&mut end));
             let miss = hold.miss(ring, &start, &end);
+            // which leaves a tenth or less of the residual
+            advance(&mut start, &(slope * miss));
             if miss.abs().max() < TOLERANCE {
-                further += 1;
-            }
-            if further > FURTHER {
                 return Ok(Self::trace(ring, start));
             }
-            advance(&mut start, &(slope * miss));
         }
         Self::newton(ring, hold)
     }
@@ -147,12 +142,15 @@ impl ClosedOrbit {
     /// Carry one ray around the ring.
     fn trace(ring: &Ring, start: Phase<f64>) -> Self {
         let (mut z, mut map) = (start, Matrix6::identity());
-        let (mut at, mut transfer) = (vec![z], vec![map]);
+        let places = ring.elements.len() + 1;
+        let (mut at, mut transfer) = (Vec::with_capacity(places), Vec::with_capacity(places));
         for element in &ring.elements {
-            map = element.linearise(&mut z) * map;
             at.push(z);
             transfer.push(map);
+            map = element.linearise(&mut z) * map;
         }
+        at.push(z);
+        transfer.push(map);
         Self { at, transfer }
     }
 

@@ -21,7 +21,7 @@
 //!
 //! Source: S. Y. Lee, Accelerator Physics, ch. 2; J. Safranek, NIM A 388 (1997) 27 for the use.
 
-use nalgebra::{DMatrix, Matrix5, Matrix6, RowVector6, Vector6};
+use nalgebra::{DMatrix, Matrix5, Matrix6, Matrix6xX, MatrixXx6, RowVector6, Vector6};
 
 use crate::lattice::{Corrector, Element, Kind, Plane, Ring};
 use crate::map::{DELTA, PATH, PX, PY, Phase, X, Y, inverse};
@@ -361,28 +361,26 @@ impl<'r> Optics<'r> {
         gradients: &[Gradient],
     ) -> Vec<DMatrix<f64>> {
         let seen = seen_rows(observers, &self.closed);
-        let far = self.closed + Matrix6::identity();
-        gradients
-            .iter()
-            .map(|gradient| {
-                // what each source sends into the gradient, and what that sends to each observer
-                let within: Vec<_> = sources.iter().map(|source| gradient.within(source)).collect();
-                let is_upstream =
-                    |(source, within): &(&Source, &Option<_>)| source.place <= gradient.place && within.is_none();
-                let sent: Vec<Vector6<f64>> = (sources.iter().zip(&within))
-                    .map(|one| if is_upstream(&one) { far * one.0.column } else { self.closed * one.0.column })
-                    .collect();
-                let mut derivative = DMatrix::zeros(observers.len(), sources.len());
-                for (i, row) in seen.iter().enumerate() {
-                    let seen = -row[usize::from(gradient.place < observers[i].place)];
-                    let row = seen * gradient.kernel;
-                    for (j, (column, within)) in sent.iter().zip(&within).enumerate() {
-                        derivative[(i, j)] = row.tr_dot(column) + within.map_or(0.0, |within| seen.tr_dot(&within));
-                    }
+        let columns = Matrix6xX::from_fn(sources.len(), |i, j| sources[j].column[i]);
+        let closed = self.closed * &columns;
+        let derivative = |gradient: &Gradient| {
+            // what the gradient sends to each observer, and what each source sends into the gradient
+            let row = |i: usize| seen[i][usize::from(gradient.place < observers[i].place)];
+            let rows = -MatrixXx6::from_fn(observers.len(), |i, j| row(i)[j]);
+            let within: Vec<_> = sources.iter().map(|source| gradient.within(source)).collect();
+            let mut sent = closed.clone();
+            for (j, mut sent) in sent.column_iter_mut().enumerate() {
+                if sources[j].place <= gradient.place && within[j].is_none() {
+                    sent += columns.column(j);
                 }
-                derivative
-            })
-            .collect()
+            }
+            let mut derivative = &rows * gradient.kernel * sent;
+            for (mut column, within) in derivative.column_iter_mut().zip(within) {
+                within.into_iter().for_each(|within| column += &rows * within);
+            }
+            derivative
+        };
+        gradients.iter().map(derivative).collect()
     }
 
     /// Observers of all read monitors, each in its own plane.

@@ -1,6 +1,6 @@
 //! The evidence of free amplitudes beside a fit whose unknowns adapt.
 
-use evidence::{Evidence, Factor, log_bayes_factor};
+use evidence::{Evidence, Factor, gram, log_bayes_factor};
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 use super::sums::{Apart, Sums};
@@ -54,7 +54,7 @@ impl<'f> Linearised<'f> {
     /// Projected pull and Gram matrix of some amplitudes.
     fn project(&self, sums: &Sums) -> (DVector<f64>, DMatrix<f64>) {
         let pull = &sums.pull - &sums.cross * &self.slope;
-        (pull, &sums.gram - &sums.cross * sums.cross.transpose())
+        (pull, &sums.gram - gram(&sums.cross.transpose()))
     }
 
     pub fn judge(&self, at: Location, sums: &Sums, sites: usize) -> Discrepancy {

@@ -7,7 +7,7 @@
 
 use core::ops::Range;
 
-use evidence::Factor;
+use evidence::{Factor, gram};
 use nalgebra::{DMatrix, DVector};
 use twin::Signature;
 
@@ -52,7 +52,7 @@ impl Data {
         let (start, n) = (self.start(b), whitened.nrows());
         let back = whitened.transpose();
         Sums {
-            gram: &back * &whitened * self.own_share(b),
+            gram: gram(&whitened) * self.own_share(b),
             cross: &back * seen.jacobian.rows(start, n),
             pull: back * seen.residual.rows(start, n),
         }
@@ -113,6 +113,16 @@ impl Sums {
             at += n;
         }
         all
+    }
+
+    /// Add those of amplitudes that do `share` as much, and of which the other readings see `other` as much.
+    pub fn add(&mut self, sums: &Self, share: f64, other: f64) {
+        let add = |to: &mut [f64], from: &[f64], factor: f64| {
+            to.iter_mut().zip(from).for_each(|(to, from)| *to += factor * from);
+        };
+        add(self.gram.as_mut_slice(), sums.gram.as_slice(), share * other);
+        add(self.cross.as_mut_slice(), sums.cross.as_slice(), share);
+        add(self.pull.as_mut_slice(), sums.pull.as_slice(), share);
     }
 
     /// Of some of the groups.

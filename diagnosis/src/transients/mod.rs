@@ -442,7 +442,7 @@ impl Fit {
 
 /// True of a frame in which a corrector kicks the beam.
 fn is_on(campaign: &Campaign, corrector: usize, frame: usize) -> bool {
-    is_powered(campaign.drives[frame].kick[corrector], campaign.recording.nominal_kick())
+    is_powered(campaign.drives[frame].kick[corrector], campaign.settings.nominal_kick)
 }
 
 /// Correctors that kick the beam in some frame.

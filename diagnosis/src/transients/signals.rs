@@ -4,6 +4,7 @@
 //! Orbits and responses are as measured, by the means of the runs, so that no model's error is taken for a transient; for white noise a run's mean is
 //! independent of the differences within it.
 
+use evidence::gram;
 use nalgebra::{DMatrix, DVector};
 use twin::{EffectKind, Site};
 
@@ -99,7 +100,7 @@ fn response(campaign: &Campaign, kick: &DMatrix<f64>, orbit: &DMatrix<f64>) -> D
         let columns = drive.select_rows(&known);
         let readings = DVector::from_iterator(known.len(), known.iter().map(|&frame| orbit[(frame, b)]));
         let noise = campaign.recording.header.noise[b];
-        let mut normal = columns.tr_mul(&columns);
+        let mut normal = gram(&columns);
         (0..normal.ncols()).for_each(|c| normal[(c, c)] += (noise / (LARGEST * unit[c])).powi(2).max(1e-12));
         let Some(factor) = normal.cholesky() else { continue };
         let found = factor.solve(&columns.tr_mul(&readings));

@@ -205,7 +205,7 @@ impl Screener<'_> {
 
     /// 0 for a monitor that reads x, 1 for one that reads y.
     fn plane(&self, b: usize) -> usize {
-        usize::from(b >= self.ring.horizontal_monitors())
+        self.ring.monitors[self.ring.read_monitors[b]].plane.index()
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
@@ -418,8 +418,8 @@ impl<'c> Screening<'c> {
 
     /// Linearise at the best params if they have left those of the model, or if readings need re-weighting.
     fn linearise_if_due(&mut self, frames: usize) {
-        let covariance = self.best.factor.inverse();
-        let moved = |i: usize| self.best.step[i].abs() > MOVED * covariance[(i, i)].sqrt();
+        let variance = self.best.factor.inverse_diagonal();
+        let moved = |i: usize| self.best.step[i].abs() > MOVED * variance[i].sqrt();
         if !self.stale && !(0..self.best.step.len()).any(moved) {
             return;
         }

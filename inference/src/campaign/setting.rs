@@ -17,7 +17,7 @@ pub struct Settings {
     pub repeatable: Vec<Option<usize>>,
     settings: Vec<Setting>,
     /// Largest kick that a corrector was set to [rad].
-    nominal_kick: f64,
+    pub nominal_kick: f64,
 }
 
 /// What is moved in a frame: powered correctors with their kicks, and the RF; and which of the times in the cycle it has.
