@@ -41,7 +41,7 @@ use super::readmission::{JUMPS, left_aside, readmitted};
 use super::units::Units;
 use super::wiring::Miswired;
 use inference::recording::Recording;
-use inference::{Campaign, Excluded, Meter, Screened, is_powered};
+use inference::{Campaign, Excluded, Meter, Screened, Settings};
 use inference::{TUNE_CALIBRATION, chi_square};
 
 /// A recording, whitened.
@@ -535,10 +535,10 @@ impl Data {
         enough("correctors that were moved", LEAST, self.driven_correctors().len())
     }
 
-    /// Correctors that were powered, by index.
+    /// Correctors that were moved, by index.
     pub fn driven_correctors(&self) -> Vec<usize> {
-        let moved = |&c: &usize| is_powered(self.drives.kick.column(c).amax(), self.drives.nominal_kick);
-        (0..self.drives.kick.ncols()).filter(moved).collect()
+        let settings = Settings::from_drives(&self.drives);
+        (0..self.drives.kick.ncols()).filter(|&c| settings.moves(c)).collect()
     }
 
     /// Monitors that have readings which count, by index.

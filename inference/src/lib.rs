@@ -37,7 +37,7 @@ pub mod stream;
 pub use bounds::{Bounded, Coordinate, Coordinates, softplus};
 pub use campaign::{
     Campaign, Excluded, Exclusions, Meter, Screened, Setting, Settings, Stray, TUNE_CALIBRATION, Times, chi_square,
-    furthest_stray, is_powered,
+    furthest_stray,
 };
 pub use diagnostics::{mcse_sd, quantile};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};

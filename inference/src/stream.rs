@@ -300,6 +300,13 @@ pub fn wire(recording: &Recording, row: &Row) -> Result<Vec<u8>, StreamError> {
     Ok(bytes)
 }
 
+/// Current at which dipoles whose field goes with it have the field of a row [A]: what a frame carries. 0 where it is not read.
+fn proportional_dipole(recording: &Recording, row: &Row) -> f64 {
+    let header = &recording.header;
+    let field = row.dipole.and_then(|current| header.dipole_field(current));
+    field.zip(header.nominal_dipole).map_or(row.dipole.unwrap_or(0.0), |(field, nominal)| field * nominal)
+}
+
 /// A row in the first slots of the largest frame.
 fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> {
     let beyond =
@@ -321,7 +328,7 @@ fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> 
         cycle_time_us: time("time in the cycle", row.cycle_time, f64::from(u32::MAX))? as u32,
         corrector: [CurrentCode::default(); large::CORRECTORS],
         magnets: MagnetCurrents {
-            dipole: current(row.dipole.unwrap_or(0.0))?,
+            dipole: current(proportional_dipole(recording, row))?,
             supply: [CurrentCode::default(); large::SUPPLIES],
         },
         rf_offset: RfCode::nearest(row.rf_offset).ok_or_else(|| beyond("rf offset", row.rf_offset))?,

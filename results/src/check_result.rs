@@ -6,7 +6,7 @@ use estimator::Walk;
 use comfy_table::CellAlignment;
 use diagnosis::{DataError, Miswired};
 use inference::stream::{self, Core};
-use inference::{Campaign, Lack, Recording, is_powered};
+use inference::{Campaign, Lack, Recording};
 use schemars::JsonSchema;
 use serde::Serialize;
 use training::rooms::large;
@@ -156,8 +156,8 @@ impl Settings {
         repeats.sort_unstable();
         let at = |i: usize| repeats.get(i).copied().unwrap_or(0);
         let largest = |c: usize| campaign.drives.iter().map(|drive| drive.kick[c].abs()).fold(0.0, f64::max);
-        let (names, nominal) = (campaign.ring.corrector_names(), campaign.recording.nominal_kick());
-        let unused: Vec<usize> = (0..names.len()).filter(|&c| !is_powered(largest(c), nominal)).collect();
+        let names = campaign.ring.corrector_names();
+        let unused: Vec<usize> = (0..names.len()).filter(|&c| !campaign.settings.moves(c)).collect();
         let mut offsets: Vec<f64> =
             campaign.recording.rows.iter().map(|row| row.rf_offset).filter(|offset| *offset != 0.0).collect();
         offsets.sort_by(f64::total_cmp);

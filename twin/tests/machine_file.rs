@@ -74,6 +74,32 @@ fn the_ramp_of_the_page_is_one_of_the_booster() {
     assert!(Ring::booster().ramp.is_empty());
 }
 
+/// The toy ring with the law of the page for its focusing quadrupoles, which state no strength of their own.
+#[test]
+fn the_currents_of_the_page_make_the_strengths_that_are_left_out() {
+    let mut file: Value = serde_json::from_str(blocks()[0].0).unwrap();
+    merge(&mut file, &serde_json::from_str(blocks()[3].0).unwrap());
+    merge(&mut file, &serde_json::json!({"k1": {"QF": null}}));
+    // 10 T m are 2.99792458 GeV/c
+    let rest = 0.938_272_088_16;
+    let energy = (2.997_924_58_f64.powi(2) + f64::powi(rest, 2)).sqrt() - rest;
+    file["reference"]["kinetic_energy_GeV"] = energy.into();
+    let ring = Ring::parse(&file.to_string(), "toy.json").unwrap();
+    // 900 A of 2 T per 1000 A over 10 T m and 0.5 m
+    assert!((ring.gradients()[0] - 0.36).abs() < 1e-12 && ring.gradients()[1] == -0.5);
+    let refused = |patch: Value| {
+        let mut file = file.clone();
+        merge(&mut file, &patch);
+        Ring::parse(&file.to_string(), "toy.json").unwrap_err().to_string()
+    };
+    let stated = refused(serde_json::json!({"k1": {"QF": 0.6}}));
+    assert!(stated.starts_with("QH_A2: expected the k1 of currents, found 0.6 stated and 0.36"), "{stated}");
+    let energy = refused(serde_json::json!({"reference": {"kinetic_energy_GeV": 2.0}}));
+    assert!(energy.starts_with("reference: expected the momentum of currents [GeV/c], found 2.78"), "{energy}");
+    let missing = refused(serde_json::json!({"currents": {"design_A": {"trim": null}}}));
+    assert_eq!(missing, "currents: expected every read-back of a current in design_A, found no trim");
+}
+
 /// JSON merge patch (RFC 7386).
 fn merge(onto: &mut Value, patch: &Value) {
     let (Value::Object(onto), Value::Object(patch)) = (&mut *onto, patch) else {
@@ -91,7 +117,7 @@ fn merge(onto: &mut Value, patch: &Value) {
 
 #[test]
 fn what_is_refused_is_refused_in_these_words() {
-    let (base, behind) = blocks()[3];
+    let (base, behind) = blocks()[4];
     let base: Value = serde_json::from_str(base).unwrap();
     assert!(Ring::parse(&base.to_string(), "toy.json").is_ok());
     let rows = table(behind);

@@ -39,7 +39,7 @@ use super::term::Term;
 use super::tested::Tested;
 use differences::{Differences, median, run_means};
 use inference::recording::Recording;
-use inference::{Campaign, is_powered};
+use inference::Campaign;
 pub use shown::Shown;
 use signals::Signals;
 use unsteady::Unsteady;
@@ -442,13 +442,12 @@ impl Fit {
 
 /// True of a frame in which a corrector kicks the beam.
 fn is_on(campaign: &Campaign, corrector: usize, frame: usize) -> bool {
-    is_powered(campaign.drives[frame].kick[corrector], campaign.settings.nominal_kick)
+    campaign.settings.setting(frame).moves(corrector)
 }
 
 /// Correctors that kick the beam in some frame.
 fn driven(campaign: &Campaign) -> Vec<usize> {
-    let kicks = |corrector: &usize| (0..campaign.drives.len()).any(|frame| is_on(campaign, *corrector, frame));
-    (0..campaign.ring.correctors.len()).filter(kicks).collect()
+    (0..campaign.ring.correctors.len()).filter(|&corrector| campaign.settings.moves(corrector)).collect()
 }
 
 /// Readings at the mean supply currents and kicks of each run, by the machine that the screening ends with: next to an integer tune every ripple

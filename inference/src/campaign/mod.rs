@@ -4,9 +4,11 @@
 
 mod common_terms;
 mod exclusion;
+mod idle;
 mod linearisation;
 mod meter;
 mod normal_equations;
+mod read_back;
 mod screen;
 mod setting;
 mod times;
@@ -28,9 +30,10 @@ use linearisation::Linearised;
 pub use linearisation::rf_orbit;
 pub use meter::{Meter, TUNE_CALIBRATION};
 pub(crate) use normal_equations::{Normal, Terms};
+use read_back::Repeats;
 pub use screen::Screened;
 use screen::{Groups, Screener, Seen, rms_by_plane};
-pub use setting::{Setting, Settings, is_powered};
+pub use setting::{Setting, Settings};
 pub use times::{Stray, Times, furthest_stray};
 
 /// A recording and what follows from it before any fit.
@@ -46,6 +49,8 @@ pub struct Campaign {
     pub prior: Prior,
     /// What drove the beam in each frame.
     pub drives: Vec<Drive>,
+    /// Share of the scatter of the correctors' read-backs that the beam follows: 1 for fluctuating currents, 0 for noise of the read-backs.
+    pub followed: f64,
     /// Time of each frame, from -1 to 1.
     pub time: Vec<f64>,
     /// Mean `ln` of each supply's factor [F].
@@ -82,6 +87,10 @@ pub struct Campaign {
     of_field: Vec<f64>,
 }
 
+/// Times that a recording is screened anew with another share of the read-backs' scatter, and the change of it below which that is not worth it.
+const PASSES: usize = 3;
+const SAME: f64 = 0.02;
+
 impl Campaign {
     /// Assemble and screen a recording of a ring, with the priors of its params.
     ///
@@ -94,29 +103,46 @@ impl Campaign {
         let ring = recording.powered(ring).into_owned();
         let believed = recording.header.believed(&ring).expect("the header is checked against its ring");
         let held = Machine::new(ring.clone(), believed, &[]).expect("there is no effect");
-        let drives = recording.drives();
-        let supplies = recording::mean_supplies(&drives);
+        let as_read = recording.drives();
+        let supplies = recording::mean_supplies(&as_read);
         let times = Times::in_recording(recording);
-        let settings = Settings::from_frames(&drives, &times.of_frame, recording.nominal_kick());
+        let settings = Settings::from_frames(&as_read, &times.of_frame, recording.nominal_kick());
         let (readings, tunes) = (readings(recording), tunes(recording));
         let (prior, of_design) = (Prior::from_ring(&ring), spurious_dispersion(&ring)?);
-        let screener = Screener {
-            held: &held,
-            ring: &ring,
-            prior: &prior,
-            drives: &drives,
-            supplies: &supplies,
-            times: &times,
-            settings: &settings,
-            groups: Groups::from_settings(&drives, &times, &settings),
-            readings: &of_beam(recording, &readings),
-            excluded: excluded(recording, &readings),
-            noise: &recording.header.noise,
-            sharing: &setting::sharing(&drives),
-            // each of two opposite offsets is given one of its own
-            spurious: of_design.map(|rms| SHARED * SQRT_2 * rms),
+        let (of_beam, sharing) = (of_beam(recording, &readings), setting::sharing(&as_read));
+        let screen = |drives: &[Drive]| {
+            let screener = Screener {
+                held: &held,
+                ring: &ring,
+                prior: &prior,
+                drives,
+                supplies: &supplies,
+                times: &times,
+                settings: &settings,
+                groups: Groups::from_settings(drives, &times, &settings),
+                readings: &of_beam,
+                excluded: excluded(recording, &readings),
+                noise: &recording.header.noise,
+                sharing: &sharing,
+                // each of two opposite offsets is given one of its own
+                spurious: of_design.map(|rms| SHARED * SQRT_2 * rms),
+            };
+            screener.run()
         };
-        let Seen { screened, params, linearised, baselines } = screener.run()?;
+        let steady = read_back::followed(&as_read, &settings, 0.0);
+        let (mut drives, mut followed, mut seen) = (as_read.clone(), 1.0, screen(&as_read)?);
+        for _ in 0..PASSES {
+            let noise: Vec<f64> = seen.screened.health.iter().map(|health| f64::from(health.weighted_as)).collect();
+            let orbits = [&as_read, &steady].map(|drives| seen.linearised.orbits(drives));
+            let repeats = Repeats::learn(&settings, &of_beam, orbits.each_ref(), &noise);
+            let share = repeats.share();
+            if (share - followed).abs() < SAME {
+                break;
+            }
+            drives = read_back::followed(&as_read, &settings, share);
+            (followed, seen) = (share, screen(&drives)?);
+        }
+        let Seen { screened, params, linearised, baselines } = seen;
         let orbit = rms_by_plane(&ring, &baselines);
         let found = ring.with_strengths(&ring.strengths(params.as_slice(), &supplies));
         let ripple = ripple_of_misaligned(&found)?;
@@ -136,6 +162,7 @@ impl Campaign {
             held,
             prior,
             drives,
+            followed,
             supplies,
             times,
             settings,

@@ -6,6 +6,7 @@ use estimator::{SAME_KICK, SAME_OFFSET};
 use nalgebra::{DMatrix, DVector};
 use twin::Drives;
 
+use super::idle::Idle;
 use crate::recording::Drive;
 
 /// Frames grouped by setting.
@@ -15,25 +16,19 @@ pub struct Settings {
     pub of_frame: Vec<usize>,
     /// The same; none of a frame in which several things were moved and that no other repeats.
     pub repeatable: Vec<Option<usize>>,
+    /// Where correctors stand idle.
+    pub idle: Idle,
     settings: Vec<Setting>,
     /// Largest kick that a corrector was set to [rad].
     pub nominal_kick: f64,
 }
 
-/// What is moved in a frame: powered correctors with their kicks, and the RF; and which of the times in the cycle it has.
+/// What is moved in a frame: correctors, each by its kick off where it stands idle, and the RF; and which of the times in the cycle it has.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setting {
     time: usize,
     kicks: Vec<(usize, f64)>,
     rf_offset: f64,
-}
-
-/// Share of the largest kick above which a corrector is powered: idle ones scatter by a thousandth.
-const POWERED: f64 = 0.05;
-
-/// True for the kick of a corrector that is powered; `nominal`: the largest kick that one was set to.
-pub fn is_powered(kick: f64, nominal: f64) -> bool {
-    kick.abs() > POWERED * nominal
 }
 
 /// True if two RF offsets are those of one setting.
@@ -42,9 +37,9 @@ fn is_same_offset(first: f64, second: f64) -> bool {
     (first - second).abs() <= f64::from(SAME_OFFSET) / 1e9
 }
 
-/// True if two kicks of one corrector are those of one setting.
-fn is_same_kick(first: f64, second: f64) -> bool {
-    (first - second).abs() <= first.abs().max(second.abs()) / f64::from(SAME_KICK)
+/// True if two kicks of one corrector are those of one setting; `scatter`: what its scatter makes of one kick.
+fn is_same_kick(first: f64, second: f64, scatter: f64) -> bool {
+    (first - second).abs() <= (first.abs().max(second.abs()) / f64::from(SAME_KICK)).max(scatter)
 }
 
 /// Number of frames with each frame's RF offset.
@@ -56,22 +51,23 @@ pub(super) fn sharing(drives: &[Drive]) -> Vec<f64> {
 impl Settings {
     /// Group the frames of a campaign, each with its time in the cycle; `nominal_kick`: the largest that a corrector was set to [rad].
     pub fn from_frames(drives: &[Drive], times: &[usize], nominal_kick: f64) -> Self {
-        let setting =
-            |(drive, time): (&Drive, &usize)| Setting::new(drive.kick.iter(), drive.rf_offset, *time, nominal_kick);
-        Self::group(drives.iter().zip(times).map(setting), nominal_kick)
+        let kick: Vec<_> = drives.iter().map(|drive| drive.kick.transpose()).collect();
+        let rf_offset: Vec<f64> = drives.iter().map(|drive| drive.rf_offset).collect();
+        Self::group(&DMatrix::from_rows(&kick), &rf_offset, times, nominal_kick)
     }
 
     /// Group drives at one time in the cycle: of frames, or of means of frames.
     pub fn from_drives(drives: &Drives) -> Self {
-        let setting =
-            |frame: usize| Setting::new(drives.kick.row(frame).iter(), drives.rf_offset[frame], 0, drives.nominal_kick);
-        Self::group((0..drives.kick.nrows()).map(setting), drives.nominal_kick)
+        let times = vec![0; drives.kick.nrows()];
+        Self::group(&drives.kick, drives.rf_offset.as_slice(), &times, drives.nominal_kick)
     }
 
-    fn group(frames: impl Iterator<Item = Setting>, nominal_kick: f64) -> Self {
+    fn group(kick: &DMatrix<f64>, rf_offset: &[f64], times: &[usize], nominal_kick: f64) -> Self {
+        let idle = Idle::from_kicks(kick, nominal_kick);
         let (mut settings, mut repeats): (Vec<Setting>, Vec<usize>) = (Vec::new(), Vec::new());
-        let index = |moved: Setting| {
-            let known = settings.iter().position(|known| known.is_repeated_by(&moved));
+        let index = |frame: usize| {
+            let moved = Setting::new(&idle, kick.row(frame).iter(), rf_offset[frame], times[frame]);
+            let known = settings.iter().position(|known| known.is_repeated_by(&moved, &idle));
             let index = known.unwrap_or_else(|| {
                 settings.push(moved);
                 repeats.push(0);
@@ -80,10 +76,15 @@ impl Settings {
             repeats[index] += 1;
             index
         };
-        let of_frame: Vec<usize> = frames.map(index).collect();
+        let of_frame: Vec<usize> = (0..times.len()).map(index).collect();
         let is_repeatable = |setting: &usize| repeats[*setting] > 1 || settings[*setting].things() <= 1;
         let repeatable = of_frame.iter().map(|setting| Some(*setting).filter(is_repeatable)).collect();
-        Self { repeatable, of_frame, settings, nominal_kick }
+        Self { repeatable, of_frame, idle, settings, nominal_kick }
+    }
+
+    /// True if a corrector is moved in any setting.
+    pub fn moves(&self, corrector: usize) -> bool {
+        self.settings.iter().any(|setting| setting.moves(corrector))
     }
 
     /// Number of settings.
@@ -96,7 +97,7 @@ impl Settings {
         &self.settings[self.of_frame[frame]]
     }
 
-    /// The corrector that is powered most in a frame, and the sign of its kick.
+    /// The corrector that is moved most in a frame, and the sign of its kick.
     pub fn kick(&self, frame: usize) -> Option<(usize, f64)> {
         let strongest =
             self.setting(frame).kicks.iter().max_by(|(_, one), (_, other)| one.abs().total_cmp(&other.abs()));
@@ -110,12 +111,12 @@ impl Settings {
         indicator
     }
 
-    /// Settings in which a corrector is powered.
+    /// Settings in which a corrector is moved.
     pub fn with_corrector(&self, corrector: usize) -> Vec<usize> {
-        (0..self.count()).filter(|&i| self.settings[i].kick_of(corrector).is_some()).collect()
+        (0..self.count()).filter(|&i| self.settings[i].moves(corrector)).collect()
     }
 
-    /// Kick of a corrector in each setting, in units of the nominal.
+    /// By how much a corrector is moved in each setting, in units of the nominal kick.
     pub fn strength_of(&self, corrector: usize) -> DVector<f64> {
         let kick = |setting: &Setting| setting.kick_of(corrector).map_or(0.0, |kick| kick / self.nominal_kick);
         DVector::from_iterator(self.count(), self.settings.iter().map(kick))
@@ -134,9 +135,9 @@ impl Settings {
 }
 
 impl Setting {
-    fn new<'k>(kicks: impl Iterator<Item = &'k f64>, rf_offset: f64, time: usize, nominal_kick: f64) -> Self {
-        let powered = kicks.copied().enumerate().filter(|(_, kick)| is_powered(*kick, nominal_kick));
-        Self { time, kicks: powered.collect(), rf_offset }
+    fn new<'k>(idle: &Idle, kicks: impl Iterator<Item = &'k f64>, rf_offset: f64, time: usize) -> Self {
+        let moved = kicks.enumerate().filter_map(|(c, kick)| Some((c, idle.moved(c, *kick)?)));
+        Self { time, kicks: moved.collect(), rf_offset }
     }
 
     /// How many things are moved.
@@ -149,14 +150,19 @@ impl Setting {
         (self.things() == 1).then(|| self.kicks.first().map(|(corrector, _)| *corrector)).flatten()
     }
 
-    /// Kick of a corrector that is powered [rad].
+    /// True if a corrector is moved.
+    pub fn moves(&self, corrector: usize) -> bool {
+        self.kick_of(corrector).is_some()
+    }
+
+    /// By how much a corrector is moved [rad].
     fn kick_of(&self, corrector: usize) -> Option<f64> {
         self.kicks.iter().find(|(powered, _)| *powered == corrector).map(|(_, kick)| *kick)
     }
 
-    fn is_repeated_by(&self, other: &Self) -> bool {
+    fn is_repeated_by(&self, other: &Self, idle: &Idle) -> bool {
         let same = |((corrector, kick), (another, again)): (&(usize, f64), &(usize, f64))| {
-            corrector == another && is_same_kick(*kick, *again)
+            corrector == another && is_same_kick(*kick, *again, idle.scatter[*corrector])
         };
         self.time == other.time
             && self.kicks.len() == other.kicks.len()
@@ -210,7 +216,6 @@ mod tests {
         assert_eq!((settings.kick(0), settings.kick(1)), (Some((1, -1.0)), None));
         assert_eq!(settings.with_corrector(0), [0]);
         assert_eq!(settings.strength_of(1).as_slice(), [-1.0, 0.0]);
-        assert!(is_powered(-2e-4, 2e-4) && !is_powered(9e-6, 2e-4));
     }
 
     #[test]

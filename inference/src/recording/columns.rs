@@ -5,7 +5,7 @@ use std::path::Path;
 use super::error::{Mismatch, Part, Place, RecordingError};
 use super::header::{Format, Header};
 use super::names::{FOCUSING, Names, feeds};
-use twin::Ring;
+use twin::{Ring, Weights};
 
 /// The columns of a file by their index.
 #[derive(Debug)]
@@ -19,8 +19,8 @@ pub(super) struct Columns {
     pub set: Option<(usize, usize)>,
     pub rf_offset: Option<usize>,
     pub dipole: Option<usize>,
-    /// Supplies [F].
-    pub supply: Vec<usize>,
+    /// Supplies [F]: columns and their weights.
+    pub supply: Vec<Vec<(usize, f64)>>,
     /// Currents that drive nothing in the model.
     pub other: Vec<usize>,
     pub corrector_current: Vec<usize>,
@@ -42,7 +42,7 @@ impl Columns {
         let known: Vec<String> = found.iter().map(|column| names.canonical(column)).collect();
         match header.format {
             Format::One => check_order(file, &in_order(names), &known, &found)?,
-            Format::Two => check_names(file, &required(header, names), &known, &found)?,
+            Format::Two => check_names(file, &required(header, ring, names, &known), &known, &found)?,
         }
         Ok(Self::by_name(known, header, ring, names))
     }
@@ -55,9 +55,15 @@ impl Columns {
             Format::One => feeds(ring).into_iter().map(|feed| FOCUSING[feed].to_owned()).collect(),
             Format::Two => names.supplies.clone(),
         };
-        let supply: Vec<usize> = supplies.iter().map(|supply| required(&supply_column(supply))).collect();
+        let of_supply = |supply: &String| match summed(ring, supply, &columns) {
+            Some(weights) => weights.0.iter().map(|(name, weight)| (required(&supply_column(name)), *weight)).collect(),
+            None => vec![(required(&supply_column(supply)), 1.0)],
+        };
+        let supply: Vec<Vec<(usize, f64)>> = supplies.iter().map(of_supply).collect();
         let dipole = header.nominal_dipole.map(|_| required("i_dipole_A"));
-        let drives = |&i: &usize| is_current(&columns[i]) && !supply.contains(&i) && Some(i) != dipole;
+        // a read-back of a sum is kept beside it
+        let alone = |i: usize| supply.iter().any(|sum| *sum == [(i, 1.0)]);
+        let drives = |&i: &usize| is_current(&columns[i]) && !alone(i) && Some(i) != dipole;
         Self {
             sequence: required("seq"),
             time: required("time_s"),
@@ -74,6 +80,12 @@ impl Columns {
             names: columns,
         }
     }
+}
+
+/// Weights of the read-backs of a supply that has no column of its own, by the machine file's supply law.
+fn summed<'r>(ring: &'r Ring, supply: &str, columns: &[String]) -> Option<&'r Weights> {
+    let weights = &ring.currents.as_ref()?.quadrupoles.get(supply)?.current;
+    (!columns.contains(&supply_column(supply))).then_some(weights)
 }
 
 /// Column of a supply's read-back.
@@ -98,9 +110,13 @@ fn instruments(names: &Names) -> impl Iterator<Item = String> {
 }
 
 /// The columns without which a file of format 2 is none.
-fn required(header: &Header, names: &Names) -> Vec<String> {
+fn required(header: &Header, ring: &Ring, names: &Names, columns: &[String]) -> Vec<String> {
     let dipole = header.nominal_dipole.map(|_| "i_dipole_A".to_owned());
-    let supplies = names.supplies.iter().map(|supply| supply_column(supply));
+    let of_supply = |supply: &String| match summed(ring, supply, columns) {
+        Some(weights) => weights.0.keys().map(|name| supply_column(name)).collect(),
+        None => vec![supply_column(supply)],
+    };
+    let supplies = names.supplies.iter().flat_map(of_supply);
     let fixed = ["seq", "time_s"].map(String::from).into_iter();
     let cycle_time = header.ramp.is_given().then(|| "t_cycle_ms".to_owned());
     fixed.chain(cycle_time).chain(dipole).chain(supplies).chain(instruments(names)).collect()

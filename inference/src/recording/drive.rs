@@ -58,8 +58,7 @@ fn ramp_at(header: &Header, row: &Row) -> At {
 /// # Panics
 /// If the row's time is not one of the ramp's: such recordings are refused.
 pub(crate) fn field(header: &Header, row: &Row) -> Option<f64> {
-    let (current, nominal) = row.dipole.zip(header.nominal_dipole)?;
-    Some(current / (nominal * ramp_at(header, row).dipole))
+    Some(header.dipole_field(row.dipole?)? / ramp_at(header, row).dipole)
 }
 
 /// Mean `ln` of each supply's factor over all frames [F]; none without frames.

@@ -131,7 +131,7 @@ impl<'a> Cells<'a> {
             correctors: at.set.map_or(Ok(Vec::new()), |columns| self.set(columns, format, names))?,
             rf_offset: at.rf_offset.map_or(Ok(0.0), |column| self.number(column, RF_OFFSET))?,
             dipole: at.dipole.map(|column| self.number(column, POSITIVE)).transpose()?,
-            supply: self.each(&at.supply, |column| self.number(column, POSITIVE))?,
+            supply: at.supply.iter().map(|sum| self.sum(sum)).collect::<Result<_, _>>()?,
             other: self.each(&at.other, |column| self.number(column, FINITE))?,
             corrector_current: self.each(&at.corrector_current, |column| self.number(column, FINITE))?,
             reading: self.each(&at.reading, |column| Ok(self.optional(column, POSITION)?.map(from_milli)))?,
@@ -182,6 +182,17 @@ impl<'a> Cells<'a> {
         read: impl Fn(usize) -> Result<T, RecordingError>,
     ) -> Result<Vec<T>, RecordingError> {
         columns.iter().map(|&column| read(column)).collect()
+    }
+
+    /// A current that is read back as a weighted sum, or by itself; a trim may be negative, the sum may not.
+    fn sum(&self, columns: &[(usize, f64)]) -> Result<f64, RecordingError> {
+        if let [(column, 1.0)] = columns {
+            return self.number(*column, POSITIVE);
+        }
+        let shares = columns.iter().map(|(column, weight)| Ok(weight * self.number(*column, FINITE)?));
+        let sum: f64 = shares.sum::<Result<_, RecordingError>>()?;
+        let place = || self.place(columns[0].0);
+        POSITIVE.check(sum).ok_or_else(|| RecordingError::Cell(place().mismatch("a sum of read-backs above 0 A", sum)))
     }
 
     fn number(&self, column: usize, limit: Limit) -> Result<f64, RecordingError> {

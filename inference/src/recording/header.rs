@@ -12,7 +12,7 @@ use std::path::Path;
 use serde::de::{Error as _, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 use twin::limits::SETTINGS;
-use twin::{Effect, EffectError, EffectKind, Holding, Rf, Ring};
+use twin::{Currents, Effect, EffectError, EffectKind, Holding, MagnetLaw, Rf, Ring};
 
 use super::error::{Part, Place, RecordingError};
 use super::limit::{POSITIVE, from_milli, in_milli};
@@ -50,6 +50,8 @@ pub struct Header {
     ///
     /// `k1 = var k1_design p(I/I_nominal)/p(1)/(I_dipole/I_dipole_nominal)`
     pub transfer: Vec<Vec<f64>>,
+    /// The same of the dipoles' field; `[0, 1]` where the machine file states no law of it [1].
+    pub dipole_transfer: Vec<f64>,
     /// The two monitors whose mean a radial loop holds, horizontal ones of the machine; always present where one is believed on.
     pub radial_loop_monitors: Option<[String; 2]>,
     /// Remarks.
@@ -95,12 +97,12 @@ pub(super) struct HeaderFile<N, T, P> {
     #[serde(rename = "bpm_sigma_mm")]
     noise: P,
     #[serde(rename = "kick_mrad_per_A")]
-    kick_per_ampere: P,
+    kick_per_ampere: Option<P>,
     kick_convention: String,
     believed_rf: BelievedRf,
     #[serde(rename = "nominal_A")]
-    nominal: N,
-    quad_transfer: T,
+    nominal: Option<N>,
+    quad_transfer: Option<T>,
     #[serde(default, deserialize_with = "pair", skip_serializing_if = "Option::is_none")]
     radial_loop_monitors: Option<[String; 2]>,
     #[serde(default, skip_serializing_if = "String::is_empty")]
@@ -158,12 +160,13 @@ impl Header {
         text.check_name(ring)?;
         let mut header = match text.format()? {
             Format::One => text.first(ring)?,
-            Format::Two => text.second(names)?,
+            Format::Two => text.second(ring, names)?,
         };
         if header.believed_rf == BelievedRf::RadialLoop && header.radial_loop_monitors.is_none() {
             return Err(text.refuse(0..0, "missing field `radial_loop_monitors`, needed as believed_rf is radial_loop"));
         }
         text.check_machine(&header, ring)?;
+        text.check_currents(&mut header, ring)?;
         text.check_loop(&header, ring)?;
         let gradient = |supply, current| header.gradient(supply, current);
         let nominal = Nominal { dipole: header.nominal_dipole, supply: &header.nominal, gradient: &gradient };
@@ -174,8 +177,12 @@ impl Header {
 
     /// Gradient of a supply's quadrupoles over that at its nominal current: `p(I/I_nominal)/p(1)`.
     pub fn gradient(&self, supply: usize, current: f64) -> f64 {
-        let transfer = |r: f64| self.transfer[supply].iter().rev().fold(0.0, |sum, c| sum * r + c);
-        transfer(current / self.nominal[supply]) / transfer(1.0)
+        relative(&self.transfer[supply], current / self.nominal[supply])
+    }
+
+    /// Field of the dipoles over that at their nominal current; none where their current is not recorded.
+    pub fn dipole_field(&self, current: f64) -> Option<f64> {
+        self.nominal_dipole.map(|nominal| relative(&self.dipole_transfer, current / nominal))
     }
 
     /// What is believed to be held while correctors kick.
@@ -227,14 +234,16 @@ impl Header {
             particle: self.particle.clone(),
             kinetic_energy: Positive(self.kinetic_energy),
             noise: by_name(&names.monitors, &self.noise, in_milli),
-            kick_per_ampere: by_name(&names.correctors, &self.kick_per_ampere, in_milli),
+            kick_per_ampere: Some(by_name(&names.correctors, &self.kick_per_ampere, in_milli)),
             kick_convention: self.kick_convention.clone(),
             believed_rf: self.believed_rf,
-            nominal: dipole.into_iter().chain(supplies).map(|(name, nominal)| (name, Positive(nominal))).collect(),
-            quad_transfer: match self.transfer.first() {
+            nominal: Some(
+                dipole.into_iter().chain(supplies).map(|(name, nominal)| (name, Positive(nominal))).collect(),
+            ),
+            quad_transfer: Some(match self.transfer.first() {
                 Some(first) if alike => Transfers::All(Transfer(first.clone())),
                 _ => Transfers::Each(names.supplies.iter().zip(&self.transfer).map(transfer).collect()),
-            },
+            }),
             radial_loop_monitors: self.radial_loop_monitors.clone(),
             note: self.note.clone(),
         };
@@ -275,7 +284,9 @@ impl Text<'_> {
 
     fn first(&self, ring: &Ring) -> Result<Header, RecordingError> {
         let file: First = self.strict()?;
-        let nominal = [file.nominal.qh, file.nominal.qv];
+        let stated = self.needed("nominal_A", file.nominal)?;
+        let nominal = [stated.qh, stated.qv];
+        let kick_per_ampere = self.needed("kick_mrad_per_A", file.kick_per_ampere)?;
         Ok(Header {
             format: Format::One,
             machine: file.machine,
@@ -284,30 +295,35 @@ impl Text<'_> {
             particle: file.particle,
             kinetic_energy: file.kinetic_energy.0,
             noise: vec![from_milli(file.noise.0); ring.read_monitors.len()],
-            kick_per_ampere: vec![from_milli(file.kick_per_ampere.0); ring.correctors.len()],
+            kick_per_ampere: vec![from_milli(kick_per_ampere.0); ring.correctors.len()],
             kick_convention: file.kick_convention,
             believed_rf: file.believed_rf,
-            nominal_dipole: Some(file.nominal.dipole.0),
+            nominal_dipole: Some(stated.dipole.0),
             nominal: feeds(ring).into_iter().map(|feed| nominal[feed].0).collect(),
-            transfer: vec![file.quad_transfer.0; ring.supplies.len()],
+            transfer: vec![self.needed("quad_transfer", file.quad_transfer)?.0; ring.supplies.len()],
+            dipole_transfer: PROPORTIONAL.into(),
             radial_loop_monitors: file.radial_loop_monitors,
             note: file.note,
             ramp: Ramp::default(),
         })
     }
 
-    fn second(&self, names: &Names) -> Result<Header, RecordingError> {
+    fn second(&self, ring: &Ring, names: &Names) -> Result<Header, RecordingError> {
         let file: Second = self.strict()?;
+        let law = ring.currents.as_ref();
         let per_monitor = |name: &str| names.monitor(name);
         let per_corrector = |name: &str| names.corrector(name);
         let (monitors, correctors) = (names.monitors.len(), names.correctors.len());
-        let mut nominal = file.nominal;
+        let mut nominal = self.needed("nominal_A", file.nominal.or_else(|| Some(nominal_by(law?))))?;
         let nominal_dipole = nominal.remove("dipole").map(|nominal| nominal.0);
-        let nominal = self.by_supply("nominal_A", &names.supplies, nominal)?.into_iter().map(|Positive(a)| a).collect();
-        let transfer = match file.quad_transfer {
+        let nominal: Vec<f64> =
+            self.by_supply("nominal_A", &names.supplies, nominal)?.into_iter().map(|Positive(a)| a).collect();
+        let transfer = match self.needed("quad_transfer", file.quad_transfer.or_else(|| Some(transfer_by(law?))))? {
             Transfers::All(transfer) => vec![transfer; names.supplies.len()],
             Transfers::Each(each) => self.by_supply("quad_transfer", &names.supplies, each)?,
         };
+        let kick = file.kick_per_ampere.or_else(|| Some(PerName::All(Positive(in_milli(law?.kick_per_ampere())))));
+        let kick = self.needed("kick_mrad_per_A", kick)?;
         Ok(Header {
             format: Format::Two,
             machine: file.machine,
@@ -316,12 +332,13 @@ impl Text<'_> {
             particle: file.particle,
             kinetic_energy: file.kinetic_energy.0,
             noise: self.by_name("bpm_sigma_mm", file.noise, monitors, per_monitor)?,
-            kick_per_ampere: self.by_name("kick_mrad_per_A", file.kick_per_ampere, correctors, per_corrector)?,
+            kick_per_ampere: self.by_name("kick_mrad_per_A", kick, correctors, per_corrector)?,
             kick_convention: file.kick_convention,
             believed_rf: file.believed_rf,
             nominal_dipole,
             nominal,
             transfer: transfer.into_iter().map(|Transfer(c)| c).collect(),
+            dipole_transfer: PROPORTIONAL.into(),
             radial_loop_monitors: file.radial_loop_monitors,
             note: file.note,
             ramp: Ramp::default(),
@@ -407,6 +424,42 @@ impl Text<'_> {
         Ok(())
     }
 
+    /// What the header states has to be what the machine file's supply law makes, from which the dipoles' field is taken.
+    fn check_currents(&self, header: &mut Header, ring: &Ring) -> Result<(), RecordingError> {
+        let Some(law) = &ring.currents else { return Ok(()) };
+        let same = |key, what: &str, expected: f64, found: f64| {
+            if (found / expected - 1.0).abs() <= SAME_CURRENT {
+                return Ok(());
+            }
+            let by_law = format!("expected {expected} {what} by the currents of {}, found {found}", ring.file);
+            Err(self.refuse_key(key, &by_law))
+        };
+        for (f, supply) in ring.supplies.iter().enumerate() {
+            let Some((nominal, magnets)) = law.supply(&supply.name).zip(law.quadrupoles.get(&supply.name)) else {
+                continue;
+            };
+            same("nominal_A", &format!("A of supply {}", supply.name), nominal, header.nominal[f])?;
+            for off in [0.99, 1.01] {
+                let expected = magnets.integrated.at(off * nominal) / magnets.integrated.at(nominal);
+                let what = format!("times the gradient of supply {} at {off} of its nominal current", supply.name);
+                same("quad_transfer", &what, expected, header.gradient(f, off * header.nominal[f]))?;
+            }
+        }
+        for &kick in &header.kick_per_ampere {
+            same("kick_mrad_per_A", "mrad/A", in_milli(law.kick_per_ampere()), in_milli(kick))?;
+        }
+        if let Some(nominal) = header.nominal_dipole {
+            same("nominal_A", "A of the dipoles", law.dipole_current(), nominal)?;
+            header.dipole_transfer = law.dipole.field.over(nominal);
+        }
+        Ok(())
+    }
+
+    /// A key that only a machine file with a supply law can spare.
+    fn needed<T>(&self, key: &str, value: Option<T>) -> Result<T, RecordingError> {
+        value.ok_or_else(|| self.refuse(0..0, &format!("missing field `{key}`")))
+    }
+
     /// A radial loop holds two horizontal monitors of the ring.
     fn check_loop(&self, header: &Header, ring: &Ring) -> Result<(), RecordingError> {
         let held = header.radial_loop(ring).transpose();
@@ -458,6 +511,30 @@ pub(super) fn kinetic_energy(text: &str) -> Option<f64> {
 
 /// Relative difference of energies that counts as rounding.
 const SAME_ENERGY: f64 = 1e-6;
+/// Relative difference of what a header and the machine file say of currents that counts as none: a tenth of the error bar of a var.
+const SAME_CURRENT: f64 = 3e-4;
+/// Transfer function of a field that goes with its current.
+const PROPORTIONAL: [f64; 2] = [0.0, 1.0];
+
+/// A transfer function over its value at the nominal current.
+fn relative(transfer: &[f64], ratio: f64) -> f64 {
+    let at = |ratio: f64| transfer.iter().rev().fold(0.0, |sum, c| sum * ratio + c);
+    at(ratio) / at(1.0)
+}
+
+/// Nominal currents by the supply law.
+fn nominal_by(law: &Currents) -> BTreeMap<String, Positive> {
+    let supplies = law.quadrupoles.keys().filter_map(|name| Some((name.clone(), Positive(law.supply(name)?))));
+    supplies.chain([("dipole".to_owned(), Positive(law.dipole_current()))]).collect()
+}
+
+/// Transfer functions by the supply law.
+fn transfer_by(law: &Currents) -> Transfers {
+    let over = |(name, magnets): (&String, &MagnetLaw)| {
+        Some((name.clone(), Transfer(magnets.integrated.over(law.supply(name)?))))
+    };
+    Transfers::Each(law.quadrupoles.iter().filter_map(over).collect())
+}
 
 /// True if a name's words, letter case aside, are the first of the other's: `ags-booster` of `AGS Booster (BNL)`.
 fn begins(whole: &str, name: &str) -> bool {

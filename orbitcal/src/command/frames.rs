@@ -153,6 +153,7 @@ fn recording(ring: &Ring, calibrated: &Calibrated, raw: &RawOrbits, rf: Rf) -> R
         nominal_dipole: None,
         nominal: Vec::new(),
         transfer: Vec::new(),
+        dipole_transfer: Vec::new(),
         radial_loop_monitors: None,
         note: "frames a second apart, as their times were not written down".into(),
         ramp: Ramp::default(),

@@ -122,7 +122,7 @@ impl Family {
     }
 
     /// The name of its supply: its own unless another is stated.
-    fn supply<'f>(&'f self, name: &'f str) -> Option<&'f str> {
+    pub fn supply<'f>(&'f self, name: &'f str) -> Option<&'f str> {
         Some(self.supply.as_deref().unwrap_or(name)).filter(|supply| *supply != DIPOLE)
     }
 

@@ -8,7 +8,8 @@ use serde::Deserialize;
 use super::family::{Circuits, Families, Listed};
 use super::label::{Named, labels};
 use super::{
-    Bend, Corrector, Element, Kind, LatticeError, Misalignment, Monitor, ParameterPrior, Particle, Plane, Ring, ramp,
+    Bend, Corrector, Currents, Element, Kind, LatticeError, Misalignment, Monitor, ParameterPrior, Particle, Plane,
+    Ring, ramp,
 };
 use crate::limits;
 
@@ -17,6 +18,8 @@ struct MachineFile {
     name: String,
     circumference_m: f64,
     k1: BTreeMap<String, f64>,
+    #[serde(default)]
+    currents: Option<Currents>,
     reference: Reference,
     #[serde(default)]
     data: Data,
@@ -33,6 +36,9 @@ struct Reference {
     #[serde(rename = "kinetic_energy_GeV")]
     kinetic_energy: f64,
 }
+
+/// Relative difference of a strength that is stated from that of the supply law, up to which it is rounding of the file's numbers.
+const SAME: f64 = 1e-6;
 
 /// What is read and fitted; further keys of `data` are for people.
 #[derive(Deserialize, Default)]
@@ -129,8 +135,9 @@ impl Ring {
 }
 
 impl MachineFile {
-    fn ring(self, file: String) -> Result<Ring, LatticeError> {
+    fn ring(mut self, file: String) -> Result<Ring, LatticeError> {
         let particle = self.particle()?;
+        self.power(&particle)?;
         let (elements, at) = self.line()?;
         let listed = self.quadrupoles(&elements, &at);
         let prior = ParameterPrior::default().or("data", self.data.prior_width, self.data.range)?;
@@ -148,12 +155,52 @@ impl MachineFile {
             elements,
             particle,
             ramp: Vec::new(),
+            currents: self.currents,
         };
         ring.set_ramp(self.ramp)?;
         for (plane, list) in [(Plane::X, &self.data.bpm_x), (Plane::Y, &self.data.bpm_y)] {
             read_monitors(&mut ring, plane, list.as_deref())?;
         }
         Ok(ring)
+    }
+
+    /// Give magnets that state no strength that of the supply law; what is stated has to be the law's.
+    fn power(&mut self, particle: &Particle) -> Result<(), LatticeError> {
+        let Some(currents) = &self.currents else { return Ok(()) };
+        let refused = |name: &str, field, found| Err(LatticeError::Field { name: name.into(), field, found });
+        if let Some((field, found)) = currents.lack() {
+            return refused("currents", field, found);
+        }
+        if !self.ramp.is_empty() {
+            return refused("currents", "no ramp beside them", format!("one of {} times", self.ramp.len()));
+        }
+        same("reference", "the momentum of currents [GeV/c]", Some(particle.momentum()), currents.momentum())?;
+        let [body_k1, body_k2] = currents.body();
+        for entry in &mut self.elements {
+            let (name, length) = (entry.name.as_str(), entry.length);
+            let family = entry.family.as_deref().unwrap_or_default();
+            let stated = entry.k1.or_else(|| self.k1.get(family).copied().filter(|_| entry.kind == "quadrupole"));
+            match entry.kind.as_str() {
+                "quadrupole" => {
+                    let supply = self.families.get(family).map_or(Some(family), |of| of.supply(family));
+                    let k1 = supply.and_then(|supply| currents.k1(supply, name, length));
+                    k1.map_or(Ok(()), |k1| same(name, "the k1 of currents", stated, k1))?;
+                    entry.k1 = k1.or(entry.k1);
+                }
+                "sbend" => {
+                    body_k1.map_or(Ok(()), |k1| same(name, "the k1 of currents", stated, k1))?;
+                    body_k2.map_or(Ok(()), |k2| same(name, "the k2 of currents", entry.k2, k2))?;
+                    (entry.k1, entry.k2) = (body_k1.or(entry.k1), body_k2.or(entry.k2));
+                }
+                "sextupole" => {
+                    let k2 = currents.k2(family, name, length);
+                    k2.map_or(Ok(()), |k2| same(name, "the k2 of currents", entry.k2, k2))?;
+                    entry.k2 = k2.or(entry.k2);
+                }
+                _ => {}
+            }
+        }
+        Ok(())
     }
 
     fn particle(&self) -> Result<Particle, LatticeError> {
@@ -210,6 +257,17 @@ impl MachineFile {
             all().filter(move |(entry, _)| entry.planes().contains(&plane)).map(move |(_, &element)| (element, plane))
         };
         of(Plane::X).chain(of(Plane::Y)).map(|(element, plane)| make(element, plane)).collect()
+    }
+}
+
+/// Refuses what is stated if it is not what the supply law makes.
+fn same(name: &str, field: &'static str, stated: Option<f64>, law: f64) -> Result<(), LatticeError> {
+    match stated.filter(|stated| (stated - law).abs() > SAME * law.abs()) {
+        Some(stated) => {
+            let found = format!("{stated} stated and {law} by the law");
+            Err(LatticeError::Field { name: name.into(), field, found })
+        }
+        None => Ok(()),
     }
 }
 

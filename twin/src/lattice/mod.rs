@@ -1,5 +1,6 @@
 //! A ring as a list of elements, read from a machine file (`docs/machine.md`).
 
+mod currents;
 mod element;
 mod error;
 mod family;
@@ -10,6 +11,7 @@ mod particle;
 mod ramp;
 mod ring;
 
+pub use currents::{Currents, DipoleLaw, MagnetLaw, Polynomial, Weights};
 pub use element::{Bend, Element, Kind, Misalignment, Plane};
 pub use error::{LatticeError, unreadable};
 pub use parameter::{Parameter, ParameterPrior, Quadrupole, Supply};

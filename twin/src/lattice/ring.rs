@@ -2,7 +2,7 @@
 
 use core::ops::AddAssign;
 
-use super::{Element, Kind, LatticeError, Parameter, Particle, Plane, Quadrupole, RampPoint, Supply};
+use super::{Currents, Element, Kind, LatticeError, Parameter, Particle, Plane, Quadrupole, RampPoint, Supply};
 
 /// One plane of a beam position monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,6 +37,8 @@ pub struct Ring {
     pub particle: Particle,
     /// Energy and nominal currents along the ramp, in the order of time; none of a machine that is always at its reference energy.
     pub ramp: Vec<RampPoint>,
+    /// The supply law, where the machine file states it.
+    pub currents: Option<Currents>,
     /// All quadrupoles `[M]`: focusing ones in beam order, then the others.
     pub quadrupoles: Vec<Quadrupole>,
     /// Main supplies of quadrupoles `[F]`, in the order of their first quadrupole; that of the dipoles is not among them.
