@@ -9,7 +9,7 @@ use lattices::import::{
 };
 use measured::lattice::ring;
 use measured::unknowns::groups;
-use measured::{Folder, MeasuredError, Model};
+use measured::{Folder, MeasuredError, Model, Settings};
 use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -100,7 +100,7 @@ fn what_is_imported_is_what_was_measured() {
     let imported = measurement(FILES[0], "response.csv", None, &conventions());
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("ring");
-    write(&imported, &path).unwrap();
+    write(&imported, &path, &Settings::default()).unwrap();
     let read = Folder::read(&path).unwrap();
     assert_eq!((&read.matrix, &read.dispersion), (&measured.matrix, &measured.dispersion));
     for (own, other) in read.correctors.iter().zip(&measured.correctors) {
@@ -111,7 +111,7 @@ fn what_is_imported_is_what_was_measured() {
     }
     assert!((read.meta.rf - measured.meta.rf).abs() < 0.1 && read.meta.delta_rf == measured.meta.delta_rf);
     assert!(twin::Ring::read(&path.join("machine.json")).is_ok());
-    let again = write(&imported, &path).unwrap_err().to_string();
+    let again = write(&imported, &path, &Settings::default()).unwrap_err().to_string();
     assert!(again.contains("ring"), "{again}");
 }
 
@@ -319,8 +319,15 @@ fn a_magnet_that_is_switched_off_has_no_field() {
     assert_eq!((whole.fringe, whole.edge_in, half.fringe, half.edge_in), (0.02, 0.05, 0.01, 0.05));
     let (_folder, path) = at(&format!(r#"{BPM}, {{{quadrupole}: "CavityPass"}}"#));
     assert!(refused(&path).contains("element Q: pass method CavityPass of a Quadrupole is not known here"));
-    let (_folder, path) = at(&format!(r#"{BPM}, {{{dipole}, "PassMethod": "DriftPass"}}"#));
-    assert!(refused(&path).contains("element B: pass method DriftPass of a dipole"));
+    // a dipole too: insertion devices are modelled so, and the rest of the ring closes
+    let (_folder, path) = at(&format!(r#"{BPM}, {COR}, {{{dipole}, "PassMethod": "DriftPass"}}"#));
+    let lattice = imported(&path).unwrap().0;
+    assert_eq!((lattice.elements[2].bend, lattice.elements[2].length), (0.0, 1.0));
+    let said = lattice.expect_ring().unwrap_err().to_string();
+    assert!(
+        said.ends_with("bend by 0.0000 degrees, expected the 360 of a ring; 1 of them are tracked as drifts"),
+        "{said}"
+    );
 }
 
 /// What moves the orbit is said, since the twin's is straight.

@@ -6,7 +6,7 @@ use lattices::import::{
     Conventions, Input, Instruments, Lacking, Lattice, Loco, Measurement, Missing, PerInstrument, Table, agreement,
     assemble, bare, write,
 };
-use measured::Folder;
+use measured::{Folder, Settings};
 use measured::lattice::ring;
 use results::Imported;
 use twin::{Hold, Optics, Rf};
@@ -81,7 +81,7 @@ fn expect_unstated(reason: &str, options: &[(&str, bool)]) -> Result<(), Command
 /// Write the folder, and compare the matrix with the lattice's.
 fn made(options: &Import, folder: &Folder, out: &Path, result: Imported) -> Result<Imported, CommandError> {
     let agreement = agreement(folder, rf(options))?;
-    write(folder, out)?;
+    write(folder, out, &Settings { rf: rf(options), ..Settings::default() })?;
     Ok(result.with_agreement(&agreement).with_folder(&out.display().to_string()))
 }
 
