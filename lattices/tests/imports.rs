@@ -529,7 +529,11 @@ fn instruments_are_chosen_by_any_field() {
     assert_eq!(choose(&["KICK"]).unwrap().corrector_names(&lattice), choose(&[]).unwrap().corrector_names(&lattice));
     assert_eq!(choose(&["*"]).unwrap().correctors.len(), lattice.elements.len() - 1);
     let said = choose(&["SOME*"]).unwrap_err().to_string();
-    assert!(said.contains("--correctors SOME*: no element has such a name; the first are BPM, KICK, COR"), "{said}");
+    assert!(said.contains("--correctors SOME*: no element has such a name; there are BPM, COR, KICK"), "{said}");
+    let said = choose(&["CommonName=Q*"]).unwrap_err().to_string();
+    assert!(said.contains("--correctors CommonName=Q*: no element has such a name; there are PKH_1, PKV_1"), "{said}");
+    let said = choose(&["Device=Q*"]).unwrap_err().to_string();
+    assert!(said.ends_with("no element has the field; fields that are text are Class, CommonName, FamName"), "{said}");
 }
 
 #[test]

@@ -129,15 +129,16 @@ impl<'a> LocoFit<'a> {
         }
         for (number, one) in parameters.iter_mut().enumerate() {
             let is_own = |field: &Field| field.word().is_none_or(|word| owner[&(field.element, word)] == number);
+            let is_empty = one.fields.is_empty();
             one.fields.retain(is_own);
-            if one.fields.is_empty() {
-                self.left_out.push(OVERWRITTEN);
-                continue;
-            }
+            let is_overwritten = one.fields.is_empty();
             one.fields.retain(|field| field.has_effect(elements));
-            if one.fields.is_empty() {
-                self.left_out.push(WITHOUT_EFFECT);
-            }
+            self.left_out.extend(match (is_empty, is_overwritten, one.fields.is_empty()) {
+                (true, ..) => Some(OTHER),
+                (_, true, _) => Some(OVERWRITTEN),
+                (_, _, true) => Some(WITHOUT_EFFECT),
+                _ => None,
+            });
         }
         self.end = end.map(|_| Vec::new());
         for (number, one) in parameters.into_iter().enumerate().filter(|(_, one)| !one.fields.is_empty()) {
@@ -262,10 +263,12 @@ fn set(field: &mut Value, index: usize, value: f64) {
 
 fn parameter(place: &Place, length: usize) -> Result<Parameter, MeasuredError> {
     let mut fields = Vec::new();
-    for one in place.structs()? {
+    // nothing, where a family is not in the lattice
+    let structs = if place.value.is_empty() { Vec::new() } else { place.structs()? };
+    for one in structs.iter().filter(|one| one.field("ElemIndex").is_some()) {
         let name = one.need("FieldName")?;
         let Some(text) = name.text() else { return Err(name.expected("the name of a field")) };
-        let (index, factor) = (index(&one)?, factor(&one)?);
+        let (index, factor) = (index(one)?, factor(one)?);
         for element in one.need("ElemIndex")?.places(length, "an element of RINGData.Lattice")? {
             fields.push(Field { element, name: text.into(), index, factor });
         }

@@ -332,8 +332,9 @@ fn fields_of_parameters_are_found_in_any_form() {
         assert_eq!(count(&[("Function", Mat::Text(expression.into()))]), 28, "{expression}");
     }
     assert_eq!(count(&[("Function", Mat::Text("sin(x)".into()))]), 27);
-    // element 2 is a drift
+    // element 2 is a drift, and a family that is not in the lattice has no element
     assert_eq!(count(&[("ElemIndex", number(2.0))]), 27);
+    assert_eq!(count(&[("ElemIndex", Mat::Numbers(vec![0, 0], Vec::new()))]), 27);
 }
 
 #[test]
