@@ -71,7 +71,7 @@ impl Field {
     fn has_effect(&self, elements: &[Value]) -> bool {
         let element = &elements[self.element];
         let is_thin = || element.get("Length").and_then(Value::as_f64).unwrap_or(0.0) <= 0.0;
-        self.word().is_none_or(|word| !at::is_off(element) && !(word == "K" && is_thin()))
+        self.word().is_none_or(|word| !(at::is_off(element) || word == "K" && is_thin()))
     }
 }
 
