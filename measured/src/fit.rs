@@ -16,7 +16,7 @@ use crate::descent::{Descent, EXACT, ROUGH, descend};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::linear::LANES;
-use crate::model::Model;
+use crate::model::{Model, Prediction};
 use crate::noise::Noise;
 use crate::normal::Places;
 use crate::uncertainty::Uncertainty;
@@ -73,6 +73,47 @@ pub struct Fit {
     pub has_ended: bool,
 }
 
+/// Where a fit begins.
+pub(crate) struct Start {
+    groups: Groups,
+    model: Model,
+    unknowns: Vec<Unknown>,
+    data: Data,
+    values: DVector<f64>,
+    prediction: Prediction,
+}
+
+impl Start {
+    /// Of a measurement.
+    pub fn of(folder: &Folder, settings: &Settings) -> Result<Self, MeasuredError> {
+        let groups = groups(folder);
+        if groups.iter().all(Vec::is_empty) {
+            return Err(MeasuredError::NoGradient(folder.name.clone()));
+        }
+        let model = Model::of(folder, &groups, settings.rf)?;
+        let of_reference = folder.meta.reference_fit.as_ref().is_none_or(|fit| fit.flags.coupling == "Yes");
+        let coupling = settings.coupling.unwrap_or(of_reference);
+        let unknowns = unknowns(folder, &groups, coupling, &settings.widths);
+        let data = Data::of(folder);
+        if data.elements() == 0 {
+            return Err(MeasuredError::Empty {
+                name: folder.name.clone(),
+                monitors: folder.monitors.len(),
+                reading: folder.monitors.iter().filter(|one| one.is_used).count(),
+                correctors: folder.correctors.len(),
+                kicking: folder.correctors.iter().filter(|one| one.is_used).count(),
+            });
+        }
+        let values = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.mean));
+        let prediction = model.predict(&unknowns, &values)?;
+        Ok(Self { groups, model, unknowns, data, values, prediction })
+    }
+}
+
+/// Standard deviations beyond which a sum of squares is no chance.
+const CERTAIN: f64 = 4.0;
+/// Noise from a few repeats is known to such a factor.
+const KNOWN: f64 = 1.5;
 /// Rounds of the model's error.
 const ROUNDS: usize = 6;
 
@@ -81,28 +122,9 @@ const ROUNDS: usize = 6;
 /// # Errors
 /// [`MeasuredError`].
 pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str)) -> Result<Fit, MeasuredError> {
-    let groups = groups(folder);
-    if groups.iter().all(Vec::is_empty) {
-        return Err(MeasuredError::NoGradient(folder.name.clone()));
-    }
-    let model = Model::of(folder, &groups, settings.rf)?;
-    let of_reference = folder.meta.reference_fit.as_ref().is_none_or(|fit| fit.flags.coupling == "Yes");
-    let coupling = settings.coupling.unwrap_or(of_reference);
-    let unknowns = unknowns(folder, &groups, coupling, &settings.widths);
-    let mut data = Data::of(folder);
-    if data.elements() == 0 {
-        return Err(MeasuredError::Empty {
-            name: folder.name.clone(),
-            monitors: folder.monitors.len(),
-            reading: folder.monitors.iter().filter(|one| one.is_used).count(),
-            correctors: folder.correctors.len(),
-            kicking: folder.correctors.iter().filter(|one| one.is_used).count(),
-        });
-    }
+    let Start { groups, model, unknowns, mut data, values, prediction: start } = Start::of(folder, settings)?;
     let megabytes = memory(&unknowns, data.measured.shape()) >> 20;
     progress(&format!("{} unknowns of {} elements, {megabytes} MB of memory", unknowns.len(), data.elements()));
-    let values = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.mean));
-    let start = model.predict(&unknowns, &values)?;
     let chi2_start = data.chi2(&start) / data.elements() as f64;
     let (mut as_stated, mut outliers) = (
         Descent { values, covariance: DMatrix::zeros(0, 0), prediction: start, steps: 0, has_ended: false },
@@ -192,6 +214,16 @@ impl Fit {
         self.uncertainty.sigma[unknown]
     }
 
+    /// By how much the stated noise is larger than what the fit leaves over, unknowns counted, where that is more than chance and than noise is
+    /// known to.
+    pub fn overstated_noise(&self) -> Option<f64> {
+        let freedom = self.elements as f64 - self.unknowns.len() as f64;
+        let left = self.chi2_loco * self.elements as f64 / freedom;
+        // a mean of so many squares scatters by the root
+        let is_chance = freedom <= 0.0 || left > 1.0 - CERTAIN * (2.0 / freedom).sqrt();
+        (!is_chance).then(|| left.powf(-0.5)).filter(|factor| *factor > KNOWN)
+    }
+
     /// Squares of the residuals over those of their scales: as an error has heavy tails, more than 1 on average.
     pub fn squares(&self) -> DMatrix<f64> {
         self.residual.component_mul(&self.residual).component_mul(&self.data.precision(&self.noise))
@@ -247,6 +279,7 @@ mod tests {
             // 600 elements and 140 unknowns: 0.77 ± 0.06 of the stated noise
             assert!((0.55..0.95).contains(&fit.chi2_loco), "{}", fit.chi2_loco);
             assert!(fit.chi2_start > 100.0 && fit.outliers.is_empty());
+            assert_eq!(fit.overstated_noise(), None);
             // the square of noise and model's error is known to 12 % from the 144 elements of a block, to 41 % from 12 of the dispersion; four
             // such errors
             let limits = [0.7, 0.7, 0.7, 0.7, 1.3, 1.3].map(|limit| limit * NOISE);
@@ -255,6 +288,16 @@ mod tests {
         // 96 strengths: their mean square scatters by 0.14
         let mean = all.iter().map(nees).sum::<f64>() / 4.0;
         assert!((0.5..1.5).contains(&mean), "NEES {mean}");
+    }
+
+    #[test]
+    fn noise_that_is_stated_ten_times_too_large_is_told() {
+        let ring = ring();
+        let mut folder = measured(&ring, &machine(&ring, 1), NOISE, 101);
+        folder.monitors.iter_mut().for_each(|one| one.sigma *= 10.0);
+        let factor = fit(&folder, &Settings::default(), &mut |_| ()).unwrap().overstated_noise().unwrap();
+        // 460 degrees of freedom tell it to 3 %, fewer where priors hold unknowns
+        assert!((8.0..11.0).contains(&factor), "{factor}");
     }
 
     /// The same matrix for kicks of 1 rad: elements of metres, noise of millimetres.

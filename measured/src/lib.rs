@@ -57,6 +57,6 @@ pub use likeness::Likeness;
 pub use model::{Model, Prediction};
 pub use optics::{Fitted, FittedOptics, FittedRing};
 pub use raw::RawOrbits;
-pub use straight::Straightened;
+pub use straight::{Straightened, expect_fit};
 pub use unknowns::{Kind, Unknown};
 pub use wiring::{Wiring, straightened};

@@ -7,7 +7,7 @@
 use nalgebra::DMatrix;
 
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Settings, fit};
+use crate::fit::{Fit, Settings, Start, fit};
 use crate::folder::Folder;
 use crate::model::Model;
 use crate::unknowns::{Kind, groups};
@@ -37,8 +37,7 @@ impl Straightened {
         settings: &Settings,
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
-        let (folder, cables) = straightened(as_measured, settings)?;
-        expect_unit(&folder, settings)?;
+        let (folder, cables) = begun(as_measured, settings)?;
         let mut here = Self { fit: fit(&folder, settings, progress)?, folder, cables };
         while let Some(better) = here.once_more(settings, progress)? {
             here = better;
@@ -83,6 +82,22 @@ impl Straightened {
         let cables = self.cables.iter().cloned().chain(more).collect();
         Ok((fit.chi2_loco < self.fit.chi2_loco).then_some(Self { folder, cables, fit }))
     }
+}
+
+/// The measurement is one that a fit begins with: a ring with a closed orbit, something to fit, elements that count, the unit of the lattice.
+///
+/// # Errors
+/// [`MeasuredError`], as of [`Straightened::of`] before its first step.
+pub fn expect_fit(as_measured: &Folder, settings: &Settings) -> Result<(), MeasuredError> {
+    let (folder, _) = begun(as_measured, settings)?;
+    Start::of(&folder, settings).map(drop)
+}
+
+/// With the cables put right that the lattice shows.
+fn begun(as_measured: &Folder, settings: &Settings) -> Result<(Folder, Vec<Wiring>), MeasuredError> {
+    let (folder, cables) = straightened(as_measured, settings)?;
+    expect_unit(&folder, settings)?;
+    Ok((folder, cables))
 }
 
 /// The matrix is about as large as that of the lattice as written: in another unit its instruments look dead.

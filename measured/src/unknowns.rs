@@ -13,7 +13,7 @@ pub enum Kind {
     Gradient(usize),
     /// Integrated vertical focusing in the middle of a straight [1/m], as of a wiggler.
     Wiggler(usize),
-    /// Gradient of each magnet of a group of gradients whose own is 0, all along it [1/m^2].
+    /// Gradient of each magnet of a group beside its own, which is 0 or nearly so, all along it [1/m^2].
     Added(usize),
     /// Share of the orbit that a held RF frequency adds, 1 where it is held and 0 where the momentum is.
     HeldFrequency,
@@ -171,10 +171,10 @@ pub fn straights(folder: &Folder) -> Vec<Magnets> {
     free.filter(|rows| length(rows) > STRAIGHT).map(device).collect()
 }
 
-/// What is fitted of a group of gradients: a factor, or a gradient that is added where the lattice has none.
+/// What is fitted of a group of gradients: a factor, or a gradient that is added where the lattice has none, or less than a magnet without one may have.
 fn of_gradients(folder: &Folder, group: usize, rows: &Magnets, widths: &Widths) -> Unknown {
     let magnets = rows.iter().map(|&row| &folder.lattice[row]);
-    if magnets.clone().any(|one| one.k1 != 0.0) {
+    if magnets.clone().any(|one| (one.k1 * one.length).abs() > widths.skew) {
         return Unknown { kind: Kind::Strength(group), mean: 1.0, width: widths.strength };
     }
     let length = magnets.map(|one| one.length).sum::<f64>() / rows.len() as f64;

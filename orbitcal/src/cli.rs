@@ -509,9 +509,9 @@ impl From<Format> for export::Format {
 pub struct Import {
     /// Lattice by pyAT or Xsuite (JSON), AT (MAT-file), MAD-X (twiss table) or in PALS; or a LOCO file (MAT-file), which has the matrix too
     pub lattice: PathBuf,
-    /// The measured response matrix: a plain table, FILE.h5:/PATH, FILE.mat:NAME or one of the Matlab Middle Layer; without it, the lattice is shown and nothing is written
+    /// The measured response matrix: a plain table, FILE.h5:/PATH, FILE.mat:NAME, or one of the Matlab Middle Layer, of pyAML or in SDDS; several are blocks of one, such as of each plane. Without it, the lattice is shown and nothing is written
     #[arg(long, value_name = "FILE", requires = "out")]
-    pub matrix: Option<PathBuf>,
+    pub matrix: Vec<PathBuf>,
     /// Folder that is made
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,

@@ -7,7 +7,7 @@ use lattices::import::{
     Conventions, KickIs, Measurement, OrbitUnit, Order, PerInstrument, Signs, Table, agreement, assemble, table_names,
 };
 use measured::lattice::machine;
-use measured::{Folder, MeasuredError};
+use measured::{Folder, MeasuredError, Settings};
 use numpy::PyArray2;
 use pyo3::prelude::*;
 use results::CheckResult;
@@ -238,7 +238,7 @@ impl Recording {
     fn write(&self, folder: PathBuf, ring: &Ring) -> PyResult<()> {
         match &self.data {
             Data::Frames(frames) => frames.write(&folder, &ring.ring).map_err(other),
-            Data::Matrix(measured) => lattices::import::write(measured, &folder).map_err(input),
+            Data::Matrix(measured) => lattices::import::write(measured, &folder, &Settings::default()).map_err(input),
         }
     }
 

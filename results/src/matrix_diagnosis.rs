@@ -11,7 +11,7 @@ use serde::Serialize;
 use twin::Rf;
 
 use crate::fit_result::Monitor;
-use crate::matrix_result::{DOUBT, MatrixFit, MatrixVar, Other, fitted_rows, others};
+use crate::matrix_result::{DOUBT, MatrixFit, MatrixVar, Other, fitted_rows, others, overstated};
 use crate::output::{fill, table};
 
 /// Findings that the sentence says.
@@ -193,6 +193,7 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
         .chain((more > 0).then(|| format!("{more} more are listed")))
         .chain(large)
         .chain(worse)
+        .chain(fitted.overstated_noise().map(overstated))
         .collect();
     parts.join("; ")
 }

@@ -33,6 +33,9 @@ pub struct MatrixFit {
     /// With the stated noise alone, at the values that make it least.
     pub chi2_loco: f64,
     pub chi2_loco_start: f64,
+    /// The stated noise over what the fit leaves over, where it is stated too large.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub overstated_noise: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tunes: Option<Tunes>,
     /// At monitors and quadrupoles, where the fitted ring is stable.
@@ -157,6 +160,7 @@ impl MatrixFit {
             chi2_per_dof: chi2 / (fit.elements as f64 - fit.unknowns.len() as f64).max(1.0),
             chi2_loco: fit.chi2_loco,
             chi2_loco_start: fit.chi2_start,
+            overstated_noise: fit.overstated_noise(),
             tunes,
             optics,
             monitors: monitors(folder, fit),
@@ -255,6 +259,11 @@ fn monitors(folder: &Folder, fit: &Fit) -> Vec<Monitor> {
 pub(crate) const DOUBT: &str =
     "The fit did not end: no ring of this lattice is near the measurement. Check the lattice, signs and units";
 
+/// Words for noise that is stated too large by a factor.
+pub(crate) fn overstated(factor: f64) -> String {
+    format!("the stated noise is {factor:.1} times as large as what the fit leaves over")
+}
+
 impl fmt::Display for MatrixFit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { recording, elements, rejected_elements, chi2_loco, chi2_loco_start, .. } = self;
@@ -265,6 +274,9 @@ impl fmt::Display for MatrixFit {
         }
         if !self.has_ended {
             writeln!(f, "{}\n", fill(&format!("{DOUBT}.")))?;
+        }
+        if let Some(noise) = self.overstated_noise.map(overstated) {
+            writeln!(f, "{}\n", fill(&format!("{noise}.")))?;
         }
         let line = format!(
             "chi2 per element with the stated noise {chi2_loco_start:.4} -> {chi2_loco:.4}; 68 % of the residuals are within: {}",

@@ -14,7 +14,7 @@ use twin::{Hold, Optics, Rf};
 
 use super::{Target, file, repository, with_file};
 
-pub(super) const TARGETS: [Target; 9] = [
+pub(super) const TARGETS: [Target; 11] = [
     Target { name: "at_json", seeds: || imports(&["twelve-cells.at.json"]), read: lattice },
     Target { name: "at_mat", seeds: || inflated("twelve-cells.at.mat"), read: lattice },
     Target { name: "loco_mat", seeds: || inflated("twelve-cells.loco.mat"), read: lattice },
@@ -24,6 +24,8 @@ pub(super) const TARGETS: [Target; 9] = [
     Target { name: "pals", seeds: || imports(&["twelve-cells.pals.yaml"]), read: lattice },
     Target { name: "table", seeds: || imports(&["response.csv", "response.txt", "dispersion.csv"]), read: table },
     Target { name: "table_binary", seeds: binary_tables, read: table },
+    Target { name: "pyaml", seeds: || imports(&["response.pyaml.json", "response.pyaml.yaml"]), read: table },
+    Target { name: "sdds", seeds: || imports(&["response-x.sdds", "response-y.sdds"]), read: table },
 ];
 
 fn imports(names: &[&str]) -> Vec<Vec<u8>> {
@@ -111,5 +113,13 @@ fn table(bytes: &[u8]) -> bool {
 }
 
 /// The file, and datasets of it: those of the seeds and of the corpus.
-const DATASETS: [&str; 6] =
-    ["", ":i8", ":/response_matrix", ":/measured_eta_x,/measured_eta_y", ":/d0", ":/d0,/d1,/d2,/d0"];
+const DATASETS: [&str; 8] = [
+    "",
+    ":i8",
+    ":/response_matrix",
+    ":/measured_eta_x,/measured_eta_y",
+    ":/d0",
+    ":/d0,/d1,/d2,/d0",
+    ":rf_response",
+    ":s",
+];

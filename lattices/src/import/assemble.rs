@@ -58,6 +58,7 @@ pub fn assemble(
     folder.matrix = DMatrix::from_fn(lines.len(), columns.len(), |i, j| signs[j] * unit * matrix.value(i, j));
     if let Some((table, step)) = dispersion {
         folder.meta.delta_rf = *step;
+        let unit = table.stated.unit.unwrap_or(conventions.unit).millimetres();
         folder.dispersion = Some(column(table, instruments, &names, *order, &lines)? * unit);
     }
     Ok(folder)

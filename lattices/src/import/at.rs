@@ -7,7 +7,7 @@
 
 use serde_json::Value;
 
-use super::element::{Element, Format, Lattice, Role};
+use super::element::{Element, Format, Lattice, Role, UNBENT};
 use super::fields::{DISPLACED, Fields, KICKS, NONE, ROLLED, Strengths, give};
 use measured::MeasuredError;
 use measured::folder::Particle;
@@ -38,6 +38,9 @@ const MAGNETS: [&str; 8] =
 
 /// What the names of pass methods contain that track a magnet's field.
 const FIELDS: [&str; 4] = ["Pole", "Bend", "Bnd", "Quad"];
+/// Pass methods that track no field, whatever the element has.
+const FIELD_FREE_PASSES: [&str; 6] =
+    ["IdentityPass", "DriftPass", "ExactDriftPass", "CorrectorPass", "AperturePass", "EAperturePass"];
 
 /// Read it.
 pub(super) fn read(file: &str, value: &Value) -> Result<Lattice, MeasuredError> {
@@ -93,7 +96,7 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
     }
     displaced(lattice, &one, fields);
     let pass = fields.value.get("PassMethod").and_then(Value::as_str).unwrap_or_default();
-    let is_off = ["IdentityPass", "DriftPass", "ExactDriftPass"].contains(&pass);
+    let is_off = is_off(fields.value);
     if MAGNETS.contains(&class) && !is_off {
         if !pass.is_empty() && !FIELDS.iter().any(|part| pass.contains(part)) {
             return Err(fields.wrong(format!("pass method {pass} of a {class} is not known here")));
@@ -102,12 +105,18 @@ fn element(lattice: &mut Lattice, fields: &Fields) -> Result<(), MeasuredError> 
         return give(lattice, one, strengths(fields)?);
     }
     if FIELD_FREE.contains(&class) || is_off {
-        if is_off && fields.number("BendingAngle")? != 0.0 {
-            return Err(fields.wrong(format!("pass method {pass} of a dipole, whose angle the reference orbit needs")));
+        if fields.number("BendingAngle")? != 0.0 {
+            lattice.leave_out(UNBENT);
         }
         return lattice.push(one);
     }
     Err(fields.wrong(format!("class {class} acts on the orbit and is not known here")))
+}
+
+/// True of an element that is tracked without a field.
+pub(super) fn is_off(element: &Value) -> bool {
+    let pass = element.get("PassMethod").and_then(Value::as_str).unwrap_or_default();
+    FIELD_FREE_PASSES.contains(&pass)
 }
 
 /// What moves the orbit that the twin begins with is said.

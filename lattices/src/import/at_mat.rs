@@ -82,10 +82,14 @@ pub(super) fn read(file: &MatFile, name: Option<&str>) -> Result<Lattice, Measur
     lattice(&file.file, &document(&variable)?, Format::AtMat)
 }
 
-/// A cell array of structs with the name of a family.
+/// A cell array of structs with the name of a family, or a struct array of these.
 fn is_one(value: &Mat) -> bool {
-    let is_element = |one: &Mat| matches!(one, Mat::Structs(_, names, values) if values.len() == 1 && names.iter().any(|name| name == "FamName"));
-    matches!(value, Mat::Cells(_, cells) if cells.first().is_some_and(is_element))
+    let has_name = |one: &Mat| matches!(one, Mat::Structs(_, names, _) if names.iter().any(|name| name == "FamName"));
+    match value {
+        Mat::Cells(_, cells) => cells.first().is_some_and(has_name),
+        Mat::Structs(_, _, values) => values.len() > 1 && has_name(value),
+        _ => false,
+    }
 }
 
 /// The lattice of a document.
@@ -114,8 +118,7 @@ pub(super) fn document(cells: &Place) -> Result<Value, MeasuredError> {
 
 /// Fields of an element that are numbers or text.
 fn object(cell: &Place) -> Result<Map<String, Value>, MeasuredError> {
-    let is_one = matches!(cell.value, Mat::Structs(_, _, values) if values.len() == 1);
-    if !is_one || cell.field("FamName").is_none() {
+    if !cell.is_struct() || cell.field("FamName").is_none() {
         return Err(cell.expected("an element, a struct with FamName"));
     }
     let fields = cell.names().iter().filter_map(|name| Some((name.clone(), json(name, cell.field(name)?.value)?)));

@@ -142,6 +142,26 @@ pub struct Stated {
     pub order: Option<Order>,
 }
 
+impl Stated {
+    /// By the words of a unit such as `mm/radian`, in small letters; what an ampere deflects by stands elsewhere.
+    pub(super) fn of_units(units: &str) -> Self {
+        let (orbit, kick) = units.split_once('/').unwrap_or((units, ""));
+        let unit = match orbit.trim() {
+            "m" | "meter" | "meters" => Some(OrbitUnit::Metres),
+            "mm" | "millimeter" | "millimeters" => Some(OrbitUnit::Millimetres),
+            "um" | "micron" | "microns" | "micrometer" => Some(OrbitUnit::Micrometres),
+            _ => None,
+        };
+        let kick = match kick.trim() {
+            "rad" | "radian" | "radians" => Some(1e3),
+            "mrad" | "milliradian" | "milliradians" => Some(1.0),
+            "urad" | "microradian" | "microradians" => Some(1e-3),
+            _ => None,
+        };
+        Self { unit, kick, kick_is: kick.map(|_| KickIs::Full), order: None }
+    }
+}
+
 impl Conventions {
     /// Full kick of a corrector's column [mrad], whose number is `kick`.
     pub(super) fn full(&self, kick: f64) -> f64 {

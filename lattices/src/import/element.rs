@@ -10,6 +10,8 @@ use twin::limits::ELEMENTS;
 
 /// Angles of dipoles in files are rounded, and are those of measured fields; all of them make a turn within this share.
 const ROUNDING: f64 = 0.01;
+/// Left out, as the code does that tracks such a dipole: an insertion device that is modelled by dipoles and switched off.
+pub(super) const UNBENT: &str = "bending of dipoles that are tracked as drifts (they are drifts)";
 /// Speed of light [m/s].
 const LIGHT: f64 = 299_792_458.0;
 
@@ -146,6 +148,12 @@ impl Lattice {
             return Ok(());
         }
         let periods = turns.recip().round();
+        if let Some(count) = self.left_out.get(UNBENT) {
+            return self.refuse(format!(
+                "the dipoles bend by {:.4} degrees, expected the 360 of a ring; {count} of them are tracked as drifts",
+                360.0 * turns
+            ));
+        }
         let hint = match (is_whole(turns * periods), self.format) {
             (false, _) => String::new(),
             (true, Format::At | Format::AtMat) => {

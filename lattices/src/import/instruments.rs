@@ -3,7 +3,7 @@
 //! An element of a name that others have too is called by its number among them, as MAD-X does: `BPM[3]` is the third. A table says the plane in front
 //! of the name, `x:BPM[3]`, where the element has both. An instrument that is chosen by another field of the file is called by that.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use twin::Plane;
 
@@ -88,13 +88,14 @@ fn labels(of: &[Instrument], names: &[String]) -> Vec<String> {
 fn chosen(lattice: &Lattice, patterns: &[Pattern], sought: Sought) -> Result<Vec<Instrument>, MeasuredError> {
     let elements = || lattice.elements.iter().enumerate().filter(|(_, one)| one.role != Role::Ring);
     if let Some(idle) = patterns.iter().find(|pattern| elements().all(|(_, one)| pattern.name(one).is_none())) {
-        let some: Vec<&str> = elements().map(|(_, one)| one.name.as_str()).take(12).collect();
-        return lattice.refuse(format!(
-            "{} {}: no element has such a name; the first are {}",
-            sought.option,
-            idle.text(),
-            some.join(", ")
-        ));
+        let words: BTreeSet<&str> = elements().filter_map(|(_, one)| idle.word(one)).collect();
+        let fields: BTreeSet<&str> = elements().flat_map(|(_, one)| one.words.keys()).map(String::as_str).collect();
+        let some = |all: BTreeSet<&str>| all.into_iter().take(12).collect::<Vec<_>>().join(", ");
+        let have = match words.is_empty() {
+            true => format!("no element has the field; fields that are text are {}", some(fields)),
+            false => format!("no element has such a name; there are {}", some(words)),
+        };
+        return lattice.refuse(format!("{} {}: {have}", sought.option, idle.text()));
     }
     let found = elements().filter_map(|(element, one)| {
         let of_type = (sought.planes)(one.role);

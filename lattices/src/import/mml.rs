@@ -1,5 +1,5 @@
-//! A response matrix of the Matlab Middle Layer (`BPMRespMat`, `GoldenBPMResp`): a 2 x 2 struct array, lines the planes of the monitors, columns those of
-//! the correctors.
+//! A response matrix of the Matlab Middle Layer (`BPMRespMat`, `GoldenBPMResp`): a struct array of up to 2 x 2, lines the planes of the monitors, columns
+//! those of the correctors.
 //!
 //! | field | holds |
 //! |---|---|
@@ -10,7 +10,7 @@
 //!
 //! Source: `measrespmat.m` and `measbpmresp.m` of the Matlab Middle Layer.
 
-use super::conventions::{KickIs, OrbitUnit, Stated};
+use super::conventions::{KickIs, Stated};
 use super::hdf5::Matrix;
 use super::instruments::Order;
 use super::mat::{Mat, Place};
@@ -21,33 +21,34 @@ const FIELDS: [&str; 3] = ["Data", "Monitor", "Actuator"];
 
 /// True of such a struct array.
 pub(super) fn is_one(value: &Mat) -> bool {
-    let Mat::Structs(shape, names, _) = value else { return false };
-    shape[..] == [2, 2] && FIELDS.iter().all(|field| names.iter().any(|name| name == field))
+    let Mat::Structs(shape, names, values) = value else { return false };
+    !values.is_empty()
+        && shape.iter().all(|one| *one <= 2)
+        && shape.len() == 2
+        && FIELDS.iter().all(|field| names.iter().any(|name| name == field))
 }
 
 /// Its blocks as one matrix, x before y and H before V, and what it says of them.
 pub(super) fn read(all: &Place) -> Result<(Matrix, Stated), MeasuredError> {
-    let block = |row: usize, column: usize| row + 2 * column;
-    let shape = |row: usize| {
-        let data = all.need_of(block(row, row), "Data")?;
-        data.shape().ok_or_else(|| data.expected("a matrix"))
-    };
-    let (x, y) = (shape(0)?, shape(1)?);
-    let (rows, columns) = ([x[0], y[0]], [x[1], y[1]]);
-    let mut matrix = Matrix { width: columns[0] + columns[1], values: Vec::new() };
+    let Mat::Structs(shape, ..) = all.value else { return Err(all.expected("a struct")) };
+    let block = |row: usize, column: usize| all.field_of(row + shape[0] * column, "Data");
+    // of a plane that was not measured no block has a size
+    let (mut rows, mut columns) = (vec![0; shape[0]], vec![0; shape[1]]);
+    for (row, column) in (0..shape[0]).flat_map(|row| (0..shape[1]).map(move |column| (row, column))) {
+        let Some(data) = block(row, column) else { continue };
+        let [lines, width] = data.shape().ok_or_else(|| data.expected("a matrix"))?;
+        (rows[row], columns[column]) = (lines.max(rows[row]), width.max(columns[column]));
+    }
+    let mut matrix = Matrix { width: columns.iter().sum(), values: Vec::new() };
     for (row, &lines) in rows.iter().enumerate() {
-        let blocks = [0, 1].map(|column| {
-            let expected = [lines, columns[column]];
-            match all.field_of(block(row, column), "Data") {
-                None => Ok(vec![f64::NAN; expected[0] * expected[1]]),
-                Some(data) if data.shape() == Some(expected) => Ok(data.numbers()?.to_vec()),
-                Some(data) => Err(data.expected(&format!("{}x{} numbers", expected[0], expected[1]))),
-            }
+        let blocks = columns.iter().enumerate().map(|(column, &width)| match block(row, column) {
+            None => Ok(vec![f64::NAN; lines * width]),
+            Some(data) if data.shape() == Some([lines, width]) => Ok(data.numbers()?.to_vec()),
+            Some(data) => Err(data.expected(&format!("{lines}x{width} numbers"))),
         });
-        let [of_h, of_v] = blocks;
-        let (of_h, of_v) = (of_h?, of_v?);
+        let blocks = blocks.collect::<Result<Vec<_>, _>>()?;
         for line in 0..lines {
-            [&of_h, &of_v].into_iter().for_each(|of| matrix.values.extend(of.iter().skip(line).step_by(lines)));
+            blocks.iter().for_each(|of| matrix.values.extend(of.iter().skip(line).step_by(lines)));
         }
     }
     Ok((matrix, stated(all)?))
@@ -55,29 +56,21 @@ pub(super) fn read(all: &Place) -> Result<(Matrix, Stated), MeasuredError> {
 
 /// The units, which all blocks must have.
 fn stated(all: &Place) -> Result<Stated, MeasuredError> {
-    let units = (0..4).map(|block| units(all, block)).collect::<Result<Vec<_>, _>>()?;
+    let count = all.elements()?.len();
+    let measured = (0..count).filter(|&block| all.field_of(block, "Data").is_some());
+    let units = measured.map(|block| units(all, block)).collect::<Result<Vec<_>, _>>()?;
+    if units.is_empty() {
+        return Err(all.wrong("Data: nothing in it"));
+    }
     if let Some(other) = units.iter().find(|one| **one != units[0]) {
         return Err(all.wrong(&format!("UnitsString: expected one in all blocks, found {} and {other}", units[0])));
     }
-    let (orbit, kick) = units[0].split_once('/').unwrap_or((&units[0], ""));
-    let unit = match orbit {
-        "m" | "meter" | "meters" => OrbitUnit::Metres,
-        "mm" | "millimeter" | "millimeters" => OrbitUnit::Millimetres,
-        "um" | "micron" | "microns" | "micrometer" => OrbitUnit::Micrometres,
-        _ => {
-            return Err(
-                all.wrong(&format!("UnitsString: expected m, mm or um over the unit of a kick, found {}", units[0]))
-            );
-        }
-    };
-    // what an ampere deflects by stands elsewhere
-    let kick = match kick {
-        "rad" | "radian" | "radians" => Some(1e3),
-        "mrad" | "milliradian" | "milliradians" => Some(1.0),
-        "urad" | "microradian" | "microradians" => Some(1e-3),
-        _ => None,
-    };
-    Ok(Stated { unit: Some(unit), kick, kick_is: Some(KickIs::Full), order: Some(Order::Planes) })
+    let stated = Stated::of_units(&units[0]);
+    if stated.unit.is_none() {
+        let problem = format!("UnitsString: expected m, mm or um over the unit of a kick, found {}", units[0]);
+        return Err(all.wrong(&problem));
+    }
+    Ok(Stated { kick_is: Some(KickIs::Full), order: Some(Order::Planes), ..stated })
 }
 
 /// `mm/radian`, in small letters.
@@ -93,6 +86,7 @@ fn units(all: &Place, block: usize) -> Result<String, MeasuredError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::import::OrbitUnit;
     use crate::import::mat::MatFile;
 
     /// Two monitors of x and one of y, one corrector of H and two of V; x to V was not measured.
@@ -138,5 +132,22 @@ mod tests {
         assert_eq!(said, "resp.mat: Rmat: UnitsString: expected m, mm or um over the unit of a kick, found v/ampere");
         let of_other = file("mm/Radian").matrix(Some("DCCT")).unwrap();
         assert_eq!((of_other.0.values, of_other.1), (vec![500.0], Stated::default()));
+    }
+
+    /// A machine that measured one plane has empty blocks, or one block alone; a delta may be one number a corrector.
+    #[test]
+    fn one_plane_is_a_matrix_too() {
+        let mut file = file("mm/Radian");
+        let Mat::Structs(_, _, values) = &mut file.variables[1].1 else { panic!("a struct") };
+        values[3][0] = Mat::Numbers(vec![0, 0], Vec::new());
+        values[1][0] = Mat::Numbers(vec![0, 0], Vec::new());
+        values[0][3] = Mat::Numbers(vec![1, 1], vec![1e-5]);
+        values[3][4] = Mat::Text("mm/Ampere".into());
+        let (matrix, stated) = file.matrix(None).unwrap();
+        assert_eq!((matrix.width, matrix.values, stated.kick), (1, vec![1.0, 2.0], Some(1e3)));
+        let Mat::Structs(shape, _, values) = &mut file.variables[1].1 else { panic!("a struct") };
+        values.truncate(1);
+        *shape = vec![1, 1];
+        assert_eq!(file.matrix(None).unwrap().0.values, [1.0, 2.0]);
     }
 }

@@ -37,11 +37,15 @@ impl Pattern {
         &self.text
     }
 
+    /// What is compared of an element: its name, or its field where it has that.
+    pub(super) fn word<'e>(&self, element: &'e Element) -> Option<&'e str> {
+        self.field.as_ref().map_or(Some(&element.name), |field| element.words.get(field)).map(String::as_str)
+    }
+
     /// The name of an element that matches, whatever its case.
     pub(super) fn name<'e>(&self, element: &'e Element) -> Option<&'e str> {
         let options = MatchOptions { case_sensitive: false, ..MatchOptions::new() };
-        let name = self.field.as_ref().map_or(Some(&element.name), |field| element.words.get(field))?;
-        self.names.matches_with(name, options).then_some(name)
+        self.word(element).filter(|name| self.names.matches_with(name, options))
     }
 
     /// The planes of an element that matches: those of the pattern, else those that its type has.

@@ -36,7 +36,10 @@ impl Lattice {
         if text.trim_start().starts_with('@') {
             return madx::read(file, text);
         }
-        let value = value(file, text)?;
+        if !text.trim_start().starts_with('{') && !text.contains("PALS:") {
+            return Err(unknown(file, &first_line(text)));
+        }
+        let value = document(file, text)?;
         if value.get("atjson").is_some() {
             at::read(file, &value)
         } else if value.get("PALS").is_some() {
@@ -52,13 +55,10 @@ impl Lattice {
 }
 
 /// JSON, in which Python may have written `NaN` and `Infinity` (null here), or YAML.
-fn value(file: &str, text: &str) -> Result<serde_json::Value, MeasuredError> {
+pub(super) fn document(file: &str, text: &str) -> Result<serde_json::Value, MeasuredError> {
     let refused = |problem: String| MeasuredError::Table { file: file.into(), problem };
     if text.trim_start().starts_with('{') {
         return json5::from_str(text).map(|Document(value)| value).map_err(|error| refused(error.to_string()));
-    }
-    if !text.contains("PALS:") {
-        return Err(unknown(file, &first_line(text)));
     }
     // the library's own limits are for less than a large ring; its depth is ours
     let nodes = NODES * ELEMENTS.most as usize;
@@ -67,6 +67,8 @@ fn value(file: &str, text: &str) -> Result<serde_json::Value, MeasuredError> {
             max_nodes: nodes, max_events: 2 * nodes, max_recorded_anchor_events: nodes / 10, max_depth: DEPTH.most as usize,
         },
         with_snippet: false,
+        // null, as those of JSON
+        non_finite_float_policy: serde_saphyr::options::NonFiniteFloatPolicy::PassThrough,
     };
     let document = serde_saphyr::from_str_with_options(text, options);
     document.map(|Document(value)| value).map_err(|error| refused(error.to_string()))

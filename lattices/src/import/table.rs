@@ -1,6 +1,6 @@
 //! A plain table of numbers: separated by commas, semicolons, tabs or spaces, with names in the first line and in the first column or without; or a
 //! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
-//! A response matrix of the Matlab Middle Layer needs no `NAME`.
+//! A response matrix of the Matlab Middle Layer needs no `NAME`. Matrices of pyAML and of SDDS have names, and say their units.
 
 use std::path::Path;
 
@@ -8,7 +8,9 @@ use super::conventions::Stated;
 use super::hdf5::{self, Matrix};
 use super::instruments::{Channel, Instrument, Order, channel, in_order, label};
 use super::mat::MatFile;
+use super::read::document;
 use super::source::{Source, bytes};
+use super::{pyaml, sdds};
 use measured::MeasuredError;
 use twin::limits::{Budget, Exceeded, FINITE, MEMORY, TEXT};
 
@@ -47,25 +49,85 @@ impl Table {
         if hdf5::is_one(&bytes) {
             return Self::of(path, hdf5::matrix(&source, bytes)?, Stated::default());
         }
+        if sdds::is_one(&bytes) {
+            return sdds::read(&file, &bytes, source.name.as_deref());
+        }
         match String::from_utf8(bytes) {
+            Ok(text) if pyaml::is_one(&text) => pyaml::read(&file, &document(&file, &text)?, source.name.as_deref()),
             Ok(text) => Self::parse(&file, &text),
             Err(_) => {
-                Err(MeasuredError::Table { file, problem: "expected a table of text, HDF5 or a MAT-file".into() })
+                Err(MeasuredError::Table { file, problem: "expected a table of text, SDDS, HDF5 or a MAT-file".into() })
             }
         }
     }
 
     /// Numbers alone.
     fn of(path: &Path, Matrix { width, values }: Matrix, stated: Stated) -> Result<Self, MeasuredError> {
-        let lines = values.chunks(width.max(1)).enumerate();
-        let rows = lines.map(|(at, values)| Line { number: at + 1, name: None, values: values.to_vec() }).collect();
-        let mut table = Self { file: path.display().to_string(), stated, columns: None, rows };
+        let lines = values.chunks(width.max(1)).map(|values| (None, values.to_vec())).collect();
+        Self::named(&path.display().to_string(), stated, None, lines)
+    }
+
+    /// Of names of columns, and lines with their names; a number that is NaN was not measured.
+    pub(super) fn named(
+        file: &str,
+        stated: Stated,
+        columns: Option<Vec<String>>,
+        lines: Vec<(Option<String>, Vec<f64>)>,
+    ) -> Result<Self, MeasuredError> {
+        let lines = lines.into_iter().enumerate();
+        let rows = lines.map(|(at, (name, values))| Line { number: at + 1, name, values }).collect();
+        let mut table = Self { file: file.into(), stated, columns, rows };
         table.check()?;
-        let mut numbers = values.iter().enumerate().filter(|(_, one)| !one.is_nan());
-        match numbers.find_map(|(at, one)| Some((at, FINITE.check(*one).err()?))) {
-            Some((at, problem)) => table.refuse(format!("line {}: {problem}", at / width + 1)),
+        let wrong = |row: &Line| {
+            let mut numbers = row.values.iter().filter(|one| !one.is_nan());
+            numbers.find_map(|one| Some(format!("line {}: {}", row.number, FINITE.check(*one).err()?)))
+        };
+        match table.rows.iter().find_map(wrong) {
+            Some(problem) => table.refuse(problem),
             None => Ok(table),
         }
+    }
+
+    /// One table of several with names of lines and columns: blocks of a matrix, as of each plane. What no table has was not measured.
+    ///
+    /// # Errors
+    /// [`MeasuredError::Table`]: a table without names, of other units, or with an element that another has too.
+    pub fn joined(self, other: Self) -> Result<Self, MeasuredError> {
+        if self.stated != other.stated {
+            return other.refuse(format!("{} states other units", self.file));
+        }
+        let is_named = |one: &Self| one.columns.is_some() && one.rows.iter().all(|row| row.name.is_some());
+        if let Some(bare) = [&self, &other].into_iter().find(|one| !is_named(one)) {
+            return bare.refuse("lines or columns have no names, by which several tables are put together".into());
+        }
+        let mut whole = self;
+        let place = |names: &mut Vec<String>, name: String| {
+            let found = names.iter().position(|own| *own == name);
+            found.unwrap_or_else(|| {
+                names.push(name);
+                names.len() - 1
+            })
+        };
+        let mut head = whole.columns.take().unwrap_or_default();
+        let columns = other.columns.clone().unwrap_or_default();
+        let columns: Vec<usize> = columns.into_iter().map(|name| place(&mut head, name)).collect();
+        whole.rows.iter_mut().for_each(|row| row.values.resize(head.len(), f64::NAN));
+        for Line { number, name, values } in &other.rows {
+            let at = whole.rows.iter().position(|row| row.name == *name).unwrap_or_else(|| {
+                whole.rows.push(Line { number: *number, name: name.clone(), values: vec![f64::NAN; head.len()] });
+                whole.rows.len() - 1
+            });
+            for (&column, &value) in columns.iter().zip(values) {
+                let own = &mut whole.rows[at].values[column];
+                if !own.is_nan() && !value.is_nan() {
+                    let name = name.as_deref().unwrap_or_default();
+                    return other.refuse(format!("{name} to {} stands in {} too", head[column], whole.file));
+                }
+                *own = if own.is_nan() { value } else { *own };
+            }
+        }
+        whole.columns = Some(head);
+        Ok(whole)
     }
 
     /// Read the text of a table; `file` appears in errors.
@@ -116,6 +178,9 @@ impl Table {
     fn check(&mut self) -> Result<(), MeasuredError> {
         let Some(first) = self.rows.first() else { return self.refuse("no line of numbers".into()) };
         let (width, is_named) = (first.values.len(), first.name.is_some());
+        if width == 0 {
+            return self.refuse(format!("line {}: no number", first.number));
+        }
         if let Some(odd) = self.rows.iter().find(|one| one.values.len() != width || one.name.is_some() != is_named) {
             let problem = format!(
                 "line {}: {} numbers{}, line {} has {width}",
@@ -209,7 +274,7 @@ fn is_number(cell: &str) -> bool {
     cell.is_empty() || cell.parse::<f64>().is_ok()
 }
 
-/// Cells of each line that has some, with the number of the line; `#` begins a comment, whatever stands in it.
+/// Cells of each line that has some, with the number of the line; `#`, `%` and `!` begin a comment, whatever stands in it.
 fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredError> {
     let refused = |problem: String| MeasuredError::Table { file: file.into(), problem };
     if let Some((number, exceeded)) = long(text) {
@@ -221,7 +286,7 @@ fn cells(file: &str, text: &str) -> Result<Vec<(usize, Vec<String>)>, MeasuredEr
         memory.take(bytes as u64).map_err(|exceeded| refused(format!("line {number}: {exceeded}")))?;
         Ok((number, cells.into_iter().map(str::to_owned).collect()))
     };
-    let is_comment = |line: &str| line.trim_start().starts_with('#');
+    let is_comment = |line: &str| line.trim_start().starts_with(['#', '%', '!']);
     let text: String =
         text.lines().map(|line| if is_comment(line) { "\n".into() } else { format!("{line}\n") }).collect();
     let Some(delimiter) = [',', ';', '\t'].into_iter().find(|one| text.contains(*one)) else {

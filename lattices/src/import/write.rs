@@ -1,21 +1,35 @@
 //! A measurement written as the folder that [`Folder::read`] reads.
 
-use std::fs;
 use std::path::Path;
+use std::{fs, io};
 
 use nalgebra::DMatrix;
 use serde_json::{Value, json};
 use twin::Plane;
 
-use measured::Folder;
-use measured::MeasuredError;
 use measured::lattice::machine;
+use measured::{Folder, MeasuredError, Settings, expect_fit};
 
-/// Write it to a folder that is made, with the ring as a machine file (`machine.json`) for `orbitcal export`.
+/// Write it to a folder that is made, with the ring as a machine file (`machine.json`) for `orbitcal export`. The folder appears as a whole, and only
+/// where `fit` takes what was written.
 ///
 /// # Errors
-/// [`MeasuredError::Read`]: the folder exists, or cannot be written.
-pub fn write(folder: &Folder, to: &Path) -> Result<(), MeasuredError> {
+/// [`MeasuredError`]: the folder exists, cannot be written, or is none that can be fitted.
+pub fn write(folder: &Folder, to: &Path, settings: &Settings) -> Result<(), MeasuredError> {
+    let failed = |source| MeasuredError::Read { file: to.display().to_string(), source };
+    if to.exists() {
+        return Err(failed(io::ErrorKind::AlreadyExists.into()));
+    }
+    let beside = to.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // of the same file system, and gone with an error
+    let made = tempfile::Builder::new().prefix(".orbitcal-").tempdir_in(beside).map_err(failed)?;
+    let whole = made.path().join("ring");
+    tables(folder, &whole)?;
+    expect_fit(&Folder { name: folder.name.clone(), ..Folder::read(&whole)? }, settings)?;
+    fs::rename(&whole, to).map_err(failed)
+}
+
+fn tables(folder: &Folder, to: &Path) -> Result<(), MeasuredError> {
     fs::create_dir(to).map_err(|source| MeasuredError::Read { file: to.display().to_string(), source })?;
     lattice(folder, &to.join("lattice.csv"))?;
     monitors(folder, &to.join("bpms.csv"))?;

@@ -6,8 +6,8 @@ use lattices::import::{
     Conventions, Input, Instruments, Lacking, Lattice, Loco, Measurement, Missing, PerInstrument, Table, agreement,
     assemble, bare, write,
 };
-use measured::Folder;
 use measured::lattice::ring;
+use measured::{Folder, Settings};
 use results::Imported;
 use twin::{Hold, Optics, Rf};
 
@@ -35,12 +35,12 @@ pub fn run(options: &Import) -> Result<(), CommandError> {
 fn of_lattice(options: &Import, lattice: &Lattice) -> Result<Imported, CommandError> {
     let instruments = Instruments::choose(lattice, &options.monitors, &options.correctors)?;
     let result = Imported::of(lattice, &instruments, tunes(&bare(lattice, &instruments)?)?);
-    match (&options.matrix, &options.out) {
-        (Some(matrix), Some(out)) => {
-            let folder = measurement(options, lattice, &instruments, matrix, out)?;
+    match (options.matrix.is_empty(), &options.out) {
+        (false, Some(out)) => {
+            let folder = measurement(options, lattice, &instruments, out)?;
             made(options, &folder, out, result)
         }
-        (None, Some(_)) => {
+        (true, Some(_)) => {
             Err(CommandError::Input(format!("{} is a lattice alone; --out needs --matrix", lattice.file)))
         }
         _ => Ok(result),
@@ -53,7 +53,7 @@ fn of_loco(options: &Import, loco: Loco) -> Result<Imported, CommandError> {
     expect_unstated(
         &format!("{} is a LOCO file, which states it", lattice.file),
         &[
-            ("--matrix", options.matrix.is_some()),
+            ("--matrix", !options.matrix.is_empty()),
             ("--monitors", !options.monitors.is_empty()),
             ("--correctors", !options.correctors.is_empty()),
             ("--orbit-unit", options.orbit_unit.is_some()),
@@ -81,7 +81,7 @@ fn expect_unstated(reason: &str, options: &[(&str, bool)]) -> Result<(), Command
 /// Write the folder, and compare the matrix with the lattice's.
 fn made(options: &Import, folder: &Folder, out: &Path, result: Imported) -> Result<Imported, CommandError> {
     let agreement = agreement(folder, rf(options))?;
-    write(folder, out)?;
+    write(folder, out, &Settings { rf: rf(options), ..Settings::default() })?;
     Ok(result.with_agreement(&agreement).with_folder(&out.display().to_string()))
 }
 
@@ -110,11 +110,12 @@ fn measurement(
     options: &Import,
     lattice: &Lattice,
     instruments: &Instruments,
-    matrix: &Path,
     out: &Path,
 ) -> Result<Folder, CommandError> {
     let name = name(out)?;
-    let matrix = Table::read(matrix)?;
+    let blocks = options.matrix.iter().map(|path| Table::read(path));
+    let joined = blocks.reduce(|whole, block| whole?.joined(block?)).transpose()?;
+    let matrix = joined.expect("a matrix was asked for");
     let conventions = conventions(options, &matrix)?;
     let dispersion = options.dispersion.as_deref().map(Table::read).transpose()?;
     let measured = Measurement {

@@ -69,10 +69,15 @@ pub(super) fn monitors(
     lines: &[Channel],
     places: &[usize],
 ) -> Result<(), MeasuredError> {
-    let noise = structs.measured.need("BPMSTD")?.many(lines.len(), "one a row of M")?;
+    let stated = structs.measured.need("BPMSTD")?;
+    let noise = match stated.numbers()? {
+        &[all] => vec![all; lines.len()],
+        _ => stated.many(lines.len(), "one a row of M")?.to_vec(),
+    };
     let good = good(&structs.monitors, ["HBPMGoodDataIndex", "VBPMGoodDataIndex"], lines)?;
-    for ((&(element, plane), &sigma), is_good) in lines.iter().zip(noise).zip(good) {
+    for ((&(element, plane), sigma), is_good) in lines.iter().zip(noise).zip(good) {
         let is_used = is_good && sigma > 0.0 && sigma.is_finite();
+        let sigma = if is_used { sigma } else { 0.0 };
         folder.monitors.push(MonitorRow { plane, at: places[element], sigma, is_used });
     }
     match folder.monitors.iter().any(|one| one.is_used) {
@@ -88,12 +93,17 @@ pub(super) fn correctors(
     columns: &[Channel],
     places: &[usize],
     lacking: &Lacking,
-    lattice: &Lattice,
+    lattice: &mut Lattice,
 ) -> Result<(), MeasuredError> {
     let kicks = kicks(&structs.correctors, columns, lacking, lattice)?;
     let good = good(&structs.correctors, ["HCMGoodDataIndex", "VCMGoodDataIndex"], columns)?;
-    for ((&(element, plane), kick), is_used) in columns.iter().zip(kicks).zip(good) {
-        folder.correctors.push(CorrectorRow { plane, at: places[element], kick, is_used });
+    for ((&(element, plane), kick), is_good) in columns.iter().zip(kicks).zip(good) {
+        let kicks = kick.is_finite() && kick != 0.0;
+        if is_good && !kicks {
+            lattice.leave_out("a corrector whose kick is stated as none");
+        }
+        let kick = if kicks { kick } else { 0.0 };
+        folder.correctors.push(CorrectorRow { plane, at: places[element], kick, is_used: is_good && kicks });
     }
     Ok(())
 }
@@ -124,20 +134,19 @@ fn kicks(
             }
         }
     }
-    match all.iter().position(|kick| !kick.is_finite() || *kick == 0.0) {
-        Some(at) => Err(correctors.wrong(&format!("kick of column {}: {} mrad", at + 1, all[at]))),
-        None => Ok(all),
-    }
+    Ok(all)
 }
 
-/// Whether each channel counts, by the last iteration; all do without lists.
+/// Whether each channel counts, by the last iteration that says so: all do where no list was made, none where it is empty.
 fn good(place: &Place, names: [&str; 2], channels: &[Channel]) -> Result<Vec<bool>, MeasuredError> {
-    let last = place.elements()?.len().saturating_sub(1);
     let (x, all) = (of_x(channels), channels.len());
     let mut is_good = vec![true; all];
     for (name, range) in names.into_iter().zip([0..x, x..all]) {
-        let Some(list) = place.field_of(last, name) else { continue };
-        let list = list.places(range.len(), "a number of a row or column of its plane")?;
+        if !place.names().iter().any(|own| own == name) {
+            continue;
+        }
+        let list = place.last(name).map(|list| list.places(range.len(), "a number of a row or column of its plane"));
+        let list = list.transpose()?.unwrap_or_default();
         range.clone().for_each(|at| is_good[at] = list.contains(&(at - range.start)));
     }
     Ok(is_good)

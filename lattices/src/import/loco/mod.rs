@@ -39,7 +39,7 @@ use measured::MeasuredError;
 
 /// Frequencies of cavity and measurement differ by less, unless one is in another unit.
 const ALIKE: f64 = 0.01;
-/// Energies of rings [GeV].
+/// Energies of rings [GeV]; in eV they are beyond any of these.
 const ENERGIES: core::ops::Range<f64> = 0.01..1e4;
 
 /// What a LOCO file holds.
@@ -89,12 +89,9 @@ pub(in crate::import) fn read(file: &MatFile, lacking: &Lacking) -> Result<Loco,
     };
     let mut document = at_mat::document(&structs.ring.need("Lattice")?)?;
     let fit = LocoFit::of(file, &document)?;
-    let not_applied = start(&fit, &mut document)?;
+    start(&fit, &mut document);
     let mut lattice = at_mat::lattice(&file.file, &document, Format::Loco)?;
-    (0..not_applied).for_each(|_| {
-        lattice
-            .leave_out("a parameter of LOCO's fit that is neither a gradient nor a skew gradient, or one of magnets in unlike ratios that starts at 0 (it stays as fitted)")
-    });
+    fit.left_out.iter().for_each(|what| lattice.leave_out(what));
     if lattice.elements.len() != fit.length {
         return lattice.refuse(format!(
             "RINGData.Lattice: {} elements make {} in a turn (Periodicity); LOCO's numbers of elements are for one",
@@ -115,9 +112,9 @@ pub(in crate::import) fn read(file: &MatFile, lacking: &Lacking) -> Result<Loco,
     let places = places(&lattice, &cut);
     folder.matrix = matrix(&structs.measured.need("M")?, lines.len(), columns.len())?;
     monitors(&mut folder, &structs, &lines, &places)?;
-    correctors(&mut folder, &structs, &columns, &places, lacking, &lattice)?;
-    dispersion(&mut folder, &structs.measured)?;
-    folder.meta.reference_fit = fit.reference([&structs.monitors, &structs.correctors], &folder, &lattice, &places)?;
+    correctors(&mut folder, &structs, &columns, &places, lacking, &mut lattice)?;
+    dispersion(&mut folder, &structs.measured, &mut lattice)?;
+    folder.meta.reference_fit = fit.reference([&structs.monitors, &structs.correctors], &folder, &lattice, &places);
     Ok(Loco { lattice, instruments, folder })
 }
 
@@ -128,10 +125,14 @@ fn matrix(place: &Place, lines: usize, columns: usize) -> Result<DMatrix<f64>, M
     }
 }
 
-fn dispersion(folder: &mut Folder, measured: &Place) -> Result<(), MeasuredError> {
+/// The dispersion, if it was measured with a step that the file states.
+fn dispersion(folder: &mut Folder, measured: &Place, lattice: &mut Lattice) -> Result<(), MeasuredError> {
     let Some(eta) = measured.field("Eta") else { return Ok(()) };
     let eta = eta.many(folder.monitors.len(), "one a row of M")?;
-    let step = measured.need("DeltaRF")?;
+    let Some(step) = measured.field("DeltaRF") else {
+        lattice.leave_out("the dispersion, whose step of the RF frequency (LocoMeasData.DeltaRF) is not stated");
+        return Ok(());
+    };
     folder.meta.delta_rf = step.number()?;
     if folder.meta.delta_rf == 0.0 {
         return Err(step.wrong("0 Hz, but Eta states the change of the orbit with it"));
@@ -145,6 +146,7 @@ fn energy(ring: &Place) -> Result<Option<f64>, MeasuredError> {
     let Some(energy) = ring.field("Energy") else { return Ok(None) };
     match energy.number()? {
         found if ENERGIES.contains(&found) => Ok(Some(found)),
+        found if ENERGIES.contains(&(found * 1e-9)) => Ok(Some(found * 1e-9)),
         found => Err(energy.wrong(&format!("expected GeV, {ENERGIES:?}, found {found}"))),
     }
 }
@@ -169,7 +171,7 @@ fn frequency(structs: &Structs, lacking: &Lacking, lattice: &mut Lattice) -> Res
     Ok(lattice.rf)
 }
 
-/// Gains and couplings that LOCO starts at are counted: a fit here starts at 1 and 0.
+/// Gains and couplings that LOCO starts at are counted: a fit here starts at 1 and 0; and those that it holds.
 fn starting_gains(structs: &Structs, lattice: &mut Lattice) -> Result<(), MeasuredError> {
     for (place, names, nominal, what) in [
         (&structs.monitors, ["HBPMGain", "VBPMGain"], 1.0, "a gain of a monitor that LOCO starts at (1 here)"),
@@ -187,8 +189,18 @@ fn starting_gains(structs: &Structs, lattice: &mut Lattice) -> Result<(), Measur
         ),
     ] {
         for list in names.into_iter().filter_map(|name| place.field(name)) {
-            let other = list.numbers()?.iter().filter(|one| one.is_finite() && **one != nominal).count();
+            let other =
+                list.numbers().unwrap_or_default().iter().filter(|one| one.is_finite() && **one != nominal).count();
             (0..other).for_each(|_| lattice.leave_out(what));
+        }
+    }
+    for (place, name, what) in [
+        (&structs.monitors, "FitGains", "gains of monitors that LOCO held (they are fitted here)"),
+        (&structs.correctors, "FitKicks", "kicks of correctors that LOCO held (they are fitted here)"),
+    ] {
+        let is_held = |one: &Place| one.text().is_some_and(|text| text.eq_ignore_ascii_case("no"));
+        if place.last(name).as_ref().is_some_and(is_held) {
+            lattice.leave_out(what);
         }
     }
     Ok(())

@@ -11,12 +11,14 @@ pub(in crate::import) struct Place<'a> {
     path: String,
     /// The value.
     pub value: &'a Mat,
+    /// Of a struct array, the element that fields are of.
+    element: Option<usize>,
 }
 
 impl<'a> Place<'a> {
     /// A variable.
     pub fn of(file: &'a str, name: &str, value: &'a Mat) -> Self {
-        Self { file, path: name.into(), value }
+        Self { file, path: name.into(), value, element: None }
     }
 
     /// Elements of a cell array or a struct array, called by Matlab's numbers; a struct's are structs of one.
@@ -32,9 +34,9 @@ impl<'a> Place<'a> {
     fn element(&self, index: usize) -> Self {
         match self.value {
             Mat::Cells(_, values) => {
-                Self { path: format!("{}{{{}}}", self.path, index + 1), value: &values[index], ..*self }
+                Self { path: format!("{}{{{}}}", self.path, index + 1), value: &values[index], element: None, ..*self }
             }
-            _ => Self { path: format!("{}({})", self.path, index + 1), ..*self },
+            _ => Self { path: format!("{}({})", self.path, index + 1), element: Some(index), ..*self },
         }
     }
 
@@ -48,13 +50,32 @@ impl<'a> Place<'a> {
         let Mat::Structs(shape, names, values) = self.value else { return None };
         let at = names.iter().position(|own| own == name)?;
         let value = values.get(element)?.get(at).filter(|value| !value.is_empty())?;
-        let number = if shape.iter().product::<usize>() > 1 { format!("({})", element + 1) } else { String::new() };
-        Some(Self { path: format!("{}{number}.{name}", self.path), value, ..*self })
+        let is_array = self.element.is_none() && shape.iter().product::<usize>() > 1;
+        let number = if is_array { format!("({})", element + 1) } else { String::new() };
+        Some(Self { path: format!("{}{number}.{name}", self.path), value, element: None, ..*self })
     }
 
-    /// A field of a struct of one.
+    /// A field of a struct of one, or of the element of an array that this is.
     pub fn field(&self, name: &str) -> Option<Self> {
-        self.field_of(0, name)
+        self.field_of(self.element.unwrap_or(0), name)
+    }
+
+    /// A field of the last element of a struct array that has something in it: LOCO adds an element an iteration, and the last may be empty.
+    pub fn last(&self, name: &str) -> Option<Self> {
+        let Mat::Structs(_, _, values) = self.value else { return None };
+        (0..values.len()).rev().find_map(|at| self.field_of(at, name))
+    }
+
+    /// Structs of a cell array, of a struct array, or of cell arrays within each other.
+    pub fn structs(&self) -> Result<Vec<Self>, MeasuredError> {
+        let all = self.elements()?.into_iter();
+        let each = all.map(|one| if one.is_struct() { Ok(vec![one]) } else { one.structs() });
+        Ok(each.collect::<Result<Vec<_>, _>>()?.concat())
+    }
+
+    /// True of one struct.
+    pub fn is_struct(&self) -> bool {
+        matches!(self.value, Mat::Structs(_, _, values) if self.element.is_some() || values.len() == 1)
     }
 
     /// The same, which must be there.
@@ -65,7 +86,7 @@ impl<'a> Place<'a> {
 
     /// The same of a struct of one.
     pub fn need(&self, name: &str) -> Result<Self, MeasuredError> {
-        self.need_of(0, name)
+        self.need_of(self.element.unwrap_or(0), name)
     }
 
     /// Numbers, the first dimension running fastest.
