@@ -4,7 +4,6 @@
 
 use std::path::{Path, PathBuf};
 
-use inference::stream::{self, Walk};
 use inference::{BatchFit, Campaign, Recording, TuneUse};
 use nalgebra::{DMatrix, DVector};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
@@ -208,21 +207,6 @@ fn scatter_of_idle_correctors_takes_no_frame_away() {
             let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
             println!("{what}: {} settings, share {:.2}", campaign.settings.count(), campaign.followed);
             assert_sound(&format!("fit of {what}"), fit.chi2_per_dof, nees(&fit, &truth));
-            let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
-            let mut last = None;
-            stream::replay(&mut core, &recording, |_, estimate| last = Some(estimate.clone())).unwrap();
-            core.prepare();
-            let quality = core.fit_quality();
-            let last = last.unwrap();
-            let n = truth.len();
-            let covariance = DMatrix::from_fn(n, n, |i, j| f64::from(core.covariance(i, j)));
-            let off = DVector::from_fn(n, |i, _| f64::from(last.map_params[i]) - truth[i].ln());
-            let nees = off.dot(&covariance.cholesky().unwrap().solve(&off)) / n as f64;
-            assert_sound(
-                &format!("replay of {what}"),
-                f64::from(quality.chi_square / quality.degrees_of_freedom),
-                nees,
-            );
         }
     }
 }
