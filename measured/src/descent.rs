@@ -139,7 +139,7 @@ impl Hill<'_> {
             match self.point(&here.values + step.component_mul(&self.width)) {
                 Ok(there) if there.height < here.height => {
                     *damping = (*damping * 0.1).max(1e-9);
-                    return Some((there, slope.dot(&step)));
+                    return Some((there, 2.0 * slope.dot(&step) - step.dot(&(curvature * &step))));
                 }
                 _ => *damping *= 10.0,
             }

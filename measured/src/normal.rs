@@ -207,7 +207,7 @@ impl Normal {
 }
 
 /// Elements whose derivatives are multiplied at once: fewer leave the processor waiting for memory.
-const DEEP: usize = 2048;
+const DEEP: usize = 512;
 
 impl OfMachine {
     fn of_columns(
