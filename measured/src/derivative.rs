@@ -1,5 +1,6 @@
 //! The derivative of a matrix by the machine's unknowns, made column by column: the whole of it is never stored.
 
+use core::ops::{Add, Mul};
 use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector};
@@ -87,8 +88,7 @@ impl ByMachine {
 
     /// Derivatives of the elements of some columns in turn, rows elements.
     pub fn columns(&self, columns: &[usize]) -> DMatrix<f64> {
-        let of_hold = |(counts, hold): &(f64, OfHold)| hold.columns(&self.pieces, columns, self.rows) * *counts;
-        let changes = self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something");
+        let changes = self.over_holds(|hold| hold.columns(&self.pieces, columns, self.rows));
         let mut made = DMatrix::zeros(changes.nrows(), self.count());
         for (mut into, group) in made.column_iter_mut().zip(&self.groups) {
             group.iter().for_each(|&(number, share)| into.axpy(share, &changes.column(number), 1.0));
@@ -102,8 +102,7 @@ impl ByMachine {
 
     /// Sum of all derivatives by each unknown, each times a weight.
     pub fn back(&self, weights: &DMatrix<f64>) -> DVector<f64> {
-        let of_hold = |(counts, hold): &(f64, OfHold)| hold.back(&self.pieces, weights) * *counts;
-        let changes = self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something");
+        let changes = self.over_holds(|hold| hold.back(&self.pieces, weights));
         let of_group = |group: &Vec<(usize, f64)>| group.iter().map(|&(number, share)| share * changes[number]).sum();
         let by_share = self.by_share.iter().map(|by_share| by_share.dot(weights));
         DVector::from_iterator(self.count(), self.groups.iter().map(of_group).chain(by_share))
@@ -115,9 +114,14 @@ impl ByMachine {
         for (group, step) in self.groups.iter().zip(step) {
             group.iter().for_each(|&(number, share)| changes[number] += share * step);
         }
-        let of_hold = |(counts, hold): &(f64, OfHold)| hold.forward(&self.pieces, &changes) * *counts;
-        let moved = self.holds.iter().map(of_hold).reduce(|sum, one| sum + one).expect("a ring holds something");
+        let moved = self.over_holds(|hold| hold.forward(&self.pieces, &changes));
         self.by_share.iter().fold(moved, |moved, by_share| moved + by_share * step[self.groups.len()])
+    }
+
+    /// The sum of what each kind of hold makes, as it counts.
+    fn over_holds<T: Add<Output = T> + Mul<f64, Output = T>>(&self, make: impl Fn(&OfHold) -> T) -> T {
+        let each = self.holds.iter().map(|(counts, hold)| make(hold) * *counts);
+        each.reduce(|sum, one| sum + one).expect("a ring holds something")
     }
 }
 

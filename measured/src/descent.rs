@@ -74,11 +74,10 @@ pub fn descend(
     let hill =
         Hill { model, unknowns, measured, weight, places, width: each(|one| one.width), mean: each(|one| one.mean) };
     let mut here = hill.point(values)?;
-    let mut curvature = hill.curvature(&here);
     let (mut damping, mut step) = (DAMPING, 0);
+    let (mut curvature, mut factor) = hill.curvature(&here, &apart).ok_or(MeasuredError::Singular(step))?;
     loop {
         let slope = hill.slope(&here);
-        let factor = Arrow::of(&curvature, &apart).ok_or(MeasuredError::Singular(step))?;
         let has_ended = slope.dot(&factor.solve(&slope)) < ENOUGH.max(share * here.height);
         let further = (!has_ended && step < STEPS)
             .then(|| hill.further(&here, (&curvature, &slope, &apart), &mut damping))
@@ -89,11 +88,10 @@ pub fn descend(
             return Ok(Descent { values, covariance, prediction, steps: step, has_ended });
         };
         let is_as_promised = ((here.height - there.height) / promised - 1.0).abs() < AS_PROMISED;
-        here = there;
+        (here, step) = (there, step + 1);
         if !is_as_promised {
-            curvature = hill.curvature(&here);
+            (curvature, factor) = hill.curvature(&here, &apart).ok_or(MeasuredError::Singular(step))?;
         }
-        step += 1;
     }
 }
 
@@ -117,11 +115,13 @@ impl Hill<'_> {
         back.component_mul(&self.width) - self.off(&here.values)
     }
 
-    /// Half the curvature, in widths.
-    fn curvature(&self, here: &Point) -> DMatrix<f64> {
+    /// Half the curvature, in widths, and its factor; none where it is not positive.
+    fn curvature(&self, here: &Point, apart: &[Vec<usize>]) -> Option<(DMatrix<f64>, Arrow)> {
         let nothing = DMatrix::zeros(self.weight.nrows(), self.weight.ncols());
-        let n = self.width.len();
-        in_widths(Normal::of(&self.places, &here.prediction, &nothing, self.weight, n).matrix, &self.width)
+        let normal = Normal::of(&self.places, &here.prediction, &nothing, self.weight, self.width.len());
+        let curvature = in_widths(normal.matrix, &self.width);
+        let factor = Arrow::of(&curvature, apart)?;
+        Some((curvature, factor))
     }
 
     /// The first better point along the curve of damped steps, from the longest on, and how much lower it was promised to be; none where not even a millionth of a
