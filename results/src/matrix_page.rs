@@ -38,19 +38,23 @@ impl Measured<'_> {
     /// # Errors
     /// [`OrbitError`] where the lattice or the fitted ring has no stable motion.
     pub fn page(&self) -> Result<Page, OrbitError> {
-        let result = self.result;
-        let tunes = result.tunes.as_ref().map_or(String::new(), |tunes| format!(" Tunes {tunes}."));
-        let lead = format!(
-            "{} elements of the response matrix, {} set aside. Chi-square per element with the stated noise: {:.4} as the lattice has it, {:.4} \
-             fitted.{tunes}",
-            result.elements, result.rejected_elements, result.chi2_loco_start, result.chi2_loco
-        );
         let sections = [self.left_over(&[])].into_iter().chain(self.ring()?).chain(self.instruments());
         Ok(Page {
             title: format!("{}: fit of the response matrix", self.folder.name),
-            lead,
+            lead: self.result.remarks().into_iter().chain([self.numbers()]).collect::<Vec<_>>().join(" "),
             sections: sections.collect(),
         })
+    }
+
+    /// What was fitted, and how well.
+    fn numbers(&self) -> String {
+        let result = self.result;
+        let tunes = result.tunes.as_ref().map_or(String::new(), |tunes| format!(" Tunes {tunes}."));
+        format!(
+            "{} elements of the response matrix, {} set aside. Chi-square per element with the stated noise: {:.4} as the lattice has it, {:.4} \
+             fitted.{tunes}",
+            result.elements, result.rejected_elements, result.chi2_loco_start, result.chi2_loco
+        )
     }
 
     /// The report of a diagnosis.
@@ -70,7 +74,7 @@ impl Measured<'_> {
         let first = [findings(found), self.left_over(&places)];
         // what is left over was its first section
         let sections = first.into_iter().chain(page.sections.into_iter().skip(1));
-        let lead = format!("{}. {}", found.sentence, page.lead);
+        let lead = format!("{}. {}", found.sentence, self.numbers());
         Ok(Page { title: format!("{}: {}", self.folder.name, found.verdict), lead, sections: sections.collect() })
     }
 

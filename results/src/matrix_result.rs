@@ -4,6 +4,7 @@ use core::fmt;
 use std::collections::BTreeMap;
 
 use comfy_table::CellAlignment;
+use diagnosis::capitalised;
 use measured::believed::{Believed, Value};
 use measured::straight::DEAD;
 use measured::unknowns::{Groups, Unknown, name};
@@ -264,6 +265,15 @@ pub(crate) fn overstated(factor: f64) -> String {
     format!("the stated noise is {factor:.1} times as large as what the fit leaves over")
 }
 
+impl MatrixFit {
+    /// What a reader must know before the numbers, in sentences.
+    pub(crate) fn remarks(&self) -> Vec<String> {
+        let doubt = (!self.has_ended).then(|| DOUBT.to_owned());
+        let noise = self.overstated_noise.map(|factor| capitalised(&overstated(factor)));
+        doubt.into_iter().chain(noise).map(|remark| format!("{remark}.")).collect()
+    }
+}
+
 impl fmt::Display for MatrixFit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { recording, elements, rejected_elements, chi2_loco, chi2_loco_start, .. } = self;
@@ -272,11 +282,8 @@ impl fmt::Display for MatrixFit {
             let done = if kind.ends_with("dead") { "left out of" } else { "put right before" };
             writeln!(f, "{}\n", fill(&format!("{done} the fit: {kind} at {}", at.replace(',', ", "))))?;
         }
-        if !self.has_ended {
-            writeln!(f, "{}\n", fill(&format!("{DOUBT}.")))?;
-        }
-        if let Some(noise) = self.overstated_noise.map(overstated) {
-            writeln!(f, "{}\n", fill(&format!("{noise}.")))?;
+        for remark in self.remarks() {
+            writeln!(f, "{}\n", fill(&remark))?;
         }
         let line = format!(
             "chi2 per element with the stated noise {chi2_loco_start:.4} -> {chi2_loco:.4}; 68 % of the residuals are within: {}",
