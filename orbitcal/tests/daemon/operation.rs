@@ -11,7 +11,7 @@ use std::thread;
 use serde_json::Value;
 use shared_memory::Subscriber;
 
-use crate::place::{Frames, Place, connected, listening, port};
+use crate::place::{Frames, Place, connected, listening, port, told};
 
 /// A change of a configuration's text.
 type Edit<'e> = &'e dyn Fn(String) -> String;
@@ -153,17 +153,17 @@ fn another_user_neither_reads_nor_disturbs_and_is_told_why() {
     place.hear("takes frames from");
     let watch = ["watch", "--service", &place.service, "--idle", "1"];
     let output = as_stranger(&program, folder.path(), &watch).unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
+    let said = told(&output);
     assert!(output.status.code() == Some(1) && said.contains("all processes need one user"), "{said}");
     let reset = ["request", "reset", "--service", &place.service];
     let output = as_stranger(&program, folder.path(), &reset).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(output.status.code(), Some(1), "{}", told(&output));
     // with folders of their own both work, each with its own
     fs::create_dir(folder.path().join("config")).unwrap();
     let own = format!("[global]\nroot-path = {:?}\nprefix = \"stranger_\"\n", folder.path().join("iceoryx2"));
     fs::write(folder.path().join("config/iceoryx2.toml"), own).unwrap();
     let output = as_stranger(&program, folder.path(), &watch).unwrap();
-    let said = String::from_utf8(output.stdout).unwrap();
+    let said = told(&output);
     assert!(output.status.success() && said.contains("0 estimates seen"), "{said}");
     connected(|| TcpStream::connect(("127.0.0.1", port))).write_all(&Frames::new().wire(3)).unwrap();
     assert_eq!(listening(&mut subscriber, 1)[0].sequence, 3, "the daemon goes on");

@@ -10,7 +10,7 @@ use std::time::Instant;
 use serde_json::Value;
 use shared_memory::Subscriber;
 
-use crate::place::{Frames, Place, SOON, connected, listening, port};
+use crate::place::{Frames, Place, SOON, connected, listening, port, told};
 
 /// What the server replies: status and body.
 fn ask(port: u16, method: &str, path: &str, host: &str) -> (u16, String) {
@@ -125,11 +125,17 @@ fn a_browser_shows_the_page_at_desk_and_phone_width() {
                     "--disable-gpu",
                     "--hide-scrollbars",
                     "--virtual-time-budget=6000",
+                    // it asks nobody else in the network, and needs little of /dev/shm
+                    "--disable-background-networking",
+                    "--disable-component-update",
+                    "--disable-dev-shm-usage",
+                    "--disable-sync",
+                    "--no-first-run",
                 ]);
                 command.arg(format!("--user-data-dir={}", profile.path().display()));
                 command.arg(format!("--window-size={width},{height}")).args([what, &url]);
                 let output = command.output().unwrap();
-                assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+                assert!(output.status.success(), "{}", told(&output));
                 String::from_utf8_lossy(&output.stdout).into_owned()
             };
             let shown = run("--dump-dom");

@@ -1,10 +1,12 @@
 //! A daemon in a folder of its own, and frames for it.
 
+use core::iter;
+use core::sync::atomic::{AtomicU16, Ordering};
 use core::time::Duration;
 use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::thread;
 use std::time::Instant;
 
@@ -134,9 +136,18 @@ impl Frames {
     }
 }
 
-/// A port that is free now.
+/// A port that no other call is given, below those that Linux gives to clients: nobody takes it before it is used.
 pub fn port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+    static GIVEN: AtomicU16 = AtomicU16::new(0);
+    let first = 20_000 + 100 * (std::process::id() % 120) as u16;
+    let is_free = |port: &u16| TcpListener::bind(("127.0.0.1", *port)).is_ok();
+    iter::repeat_with(|| first + GIVEN.fetch_add(1, Ordering::Relaxed)).find(is_free).unwrap()
+}
+
+/// What a program has said, and how it ended, where that is not as expected.
+pub fn told(output: &Output) -> String {
+    let [out, err] = [&output.stdout, &output.stderr].map(|said| String::from_utf8_lossy(said));
+    format!("{}\nstdout: {out}\nstderr: {err}", output.status)
 }
 
 pub fn listening(subscriber: &mut Subscriber, until: usize) -> Vec<EstimateRecord> {
