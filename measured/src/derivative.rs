@@ -26,8 +26,9 @@ pub struct ByMachine {
     rows: usize,
     /// Pieces of the corrector of each column.
     pieces: Vec<Vec<usize>>,
-    /// Numbers that the unknowns change, with their shares of each.
-    groups: Vec<Vec<(usize, f64)>>,
+    /// Unknowns that change groups, and for each number the unknowns that change it with their shares.
+    groups: usize,
+    shares: Vec<Vec<(usize, f64)>>,
     /// Of each kind of hold, and what it counts.
     holds: Vec<(f64, OfHold)>,
     by_share: Option<DMatrix<f64>>,
@@ -56,9 +57,12 @@ impl ByMachine {
         changes.values_mut().enumerate().for_each(|(number, at)| *at = number);
         let gradients: Vec<Gradient> =
             changes.keys().map(|&(element, change)| gradient(optics, element, change)).collect();
-        let group = |group: &Vec<Share>| {
-            group.iter().map(|&(element, change, share)| (changes[&(element, change)], share)).collect()
-        };
+        let mut shares = vec![Vec::new(); changes.len()];
+        for (unknown, group) in unknowns.iter().enumerate() {
+            group
+                .iter()
+                .for_each(|&(element, change, share)| shares[changes[&(element, change)]].push((unknown, share)));
+        }
         let mut next = 0;
         let pieces = pieces.map(|count| {
             next += count;
@@ -68,7 +72,8 @@ impl ByMachine {
         Self {
             rows: observers.len(),
             pieces: pieces.collect(),
-            groups: unknowns.iter().map(group).collect(),
+            groups: unknowns.len(),
+            shares,
             holds: vec![(1.0, OfHold { factors: optics.response_factors(observers, sources, gradients), dispersion })],
             by_share: None,
         }
@@ -83,39 +88,65 @@ impl ByMachine {
 
     /// Unknowns.
     pub fn count(&self) -> usize {
-        self.groups.len() + usize::from(self.by_share.is_some())
+        self.groups + usize::from(self.by_share.is_some())
     }
 
     /// Derivatives of the elements of some columns in turn, rows elements.
     pub fn columns(&self, columns: &[usize]) -> DMatrix<f64> {
-        let changes = self.over_holds(|hold| hold.columns(&self.pieces, columns, self.rows));
-        let mut made = DMatrix::zeros(changes.nrows(), self.count());
-        for (mut into, group) in made.column_iter_mut().zip(&self.groups) {
-            group.iter().for_each(|&(number, share)| into.axpy(share, &changes.column(number), 1.0));
+        self.weighted(columns, &DVector::from_element(columns.len() * self.rows, 1.0))
+    }
+
+    /// The same, each element times its weight.
+    pub fn weighted(&self, columns: &[usize], weights: &DVector<f64>) -> DMatrix<f64> {
+        let orbits: Vec<&[usize]> =
+            columns.iter().filter_map(|&column| self.pieces.get(column).map(Vec::as_slice)).collect();
+        let mut made = DMatrix::zeros(weights.len(), self.count());
+        let [mut all, mut one] = [(); 2].map(|()| DVector::zeros(weights.len()));
+        for (number, shares) in self.shares.iter().enumerate() {
+            all.fill(0.0);
+            for (counts, hold) in &self.holds {
+                hold.columns(&orbits, number, one.as_mut_slice());
+                all.cmpy(*counts, &one, weights, 1.0);
+            }
+            shares.iter().for_each(|&(unknown, share)| made.column_mut(unknown).axpy(share, &all, 1.0));
         }
         if let Some(by_share) = &self.by_share {
             let by_share = columns.iter().flat_map(|&column| by_share.column(column).into_iter().copied());
-            made.set_column(self.groups.len(), &DVector::from_iterator(changes.nrows(), by_share));
+            made.set_column(self.groups, &DVector::from_iterator(weights.len(), by_share).component_mul(weights));
         }
         made
     }
 
-    /// Sum of all derivatives by each unknown, each times a weight.
-    pub fn back(&self, weights: &DMatrix<f64>) -> DVector<f64> {
-        let changes = self.over_holds(|hold| hold.back(&self.pieces, weights));
-        let of_group = |group: &Vec<(usize, f64)>| group.iter().map(|&(number, share)| share * changes[number]).sum();
-        let by_share = self.by_share.iter().map(|by_share| by_share.dot(weights));
-        DVector::from_iterator(self.count(), self.groups.iter().map(of_group).chain(by_share))
+    /// `sum_i w_ij dG_ij/dx` of each column, rows, by each unknown, columns.
+    pub fn by_column(&self, weights: &DMatrix<f64>) -> DMatrix<f64> {
+        let changes = self.over_holds(|hold| hold.by_column(&self.pieces, weights));
+        let by_share = self.by_share.as_ref().map(|by_share| by_share.component_mul(weights).row_sum_tr());
+        self.by_unknown(&changes, by_share)
+    }
+
+    /// `sum_j w_ij dG_ij/dx` of each row, rows, by each unknown, columns.
+    pub fn by_row(&self, weights: &DMatrix<f64>) -> DMatrix<f64> {
+        let changes = self.over_holds(|hold| hold.by_row(&self.pieces, weights));
+        let by_share = self.by_share.as_ref().map(|by_share| by_share.component_mul(weights).column_sum());
+        self.by_unknown(&changes, by_share)
+    }
+
+    /// What lines say of the numbers that change, and of the share, as what they say of the unknowns.
+    fn by_unknown(&self, changes: &DMatrix<f64>, by_share: Option<DVector<f64>>) -> DMatrix<f64> {
+        let mut said = DMatrix::zeros(changes.nrows(), self.count());
+        for (change, shares) in changes.column_iter().zip(&self.shares) {
+            shares.iter().for_each(|&(unknown, share)| said.column_mut(unknown).axpy(share, &change, 1.0));
+        }
+        by_share.iter().for_each(|by_share| said.set_column(self.groups, by_share));
+        said
     }
 
     /// How far a step of the unknowns moves all elements.
     pub fn forward(&self, step: &DVector<f64>) -> DMatrix<f64> {
-        let mut changes = DVector::zeros(self.holds[0].1.factors.count());
-        for (group, step) in self.groups.iter().zip(step) {
-            group.iter().for_each(|&(number, share)| changes[number] += share * step);
-        }
+        let change = |shares: &Vec<(usize, f64)>| shares.iter().map(|&(unknown, share)| share * step[unknown]).sum();
+        let changes = DVector::from_iterator(self.shares.len(), self.shares.iter().map(change));
         let moved = self.over_holds(|hold| hold.forward(&self.pieces, &changes));
-        self.by_share.iter().fold(moved, |moved, by_share| moved + by_share * step[self.groups.len()])
+        self.by_share.iter().fold(moved, |moved, by_share| moved + by_share * step[self.groups])
     }
 
     /// The sum of what each kind of hold makes, as it counts.
@@ -126,25 +157,32 @@ impl ByMachine {
 }
 
 impl OfHold {
-    /// The derivatives of some columns in turn: those of correctors' pieces, and the last one.
-    fn columns(&self, pieces: &[Vec<usize>], columns: &[usize], rows: usize) -> DMatrix<f64> {
-        let orbits: Vec<&[usize]> =
-            columns.iter().filter_map(|&column| pieces.get(column).map(Vec::as_slice)).collect();
-        let (kicked, all) = (orbits.len() * rows, columns.len() * rows);
-        let mut made = DMatrix::zeros(all, self.factors.count());
-        for (gradient, column) in made.as_mut_slice().chunks_exact_mut(all).enumerate() {
-            self.factors.orbits(&orbits, gradient, &mut column[..kicked]);
+    /// The derivatives of some columns in turn by a number that changes: those of correctors' orbits, and the last one where there is room.
+    fn columns(&self, orbits: &[&[usize]], number: usize, into: &mut [f64]) {
+        self.factors.orbits(orbits, number, into);
+        if let Some(dispersion) = &self.dispersion {
+            let last = into.chunks_exact_mut(dispersion.nrows()).skip(orbits.len());
+            last.for_each(|last| last.copy_from_slice(dispersion.column(number).data.into_slice()));
         }
-        if let Some(dispersion) = self.dispersion.as_ref().filter(|_| kicked < all) {
-            made.rows_mut(kicked, rows).copy_from(dispersion);
-        }
-        made
     }
 
-    fn back(&self, pieces: &[Vec<usize>], weights: &DMatrix<f64>) -> DVector<f64> {
-        let back = self.factors.back(&slices(pieces), &weights.columns_range(..pieces.len()));
-        let last = weights.columns_range(pieces.len()..);
-        self.dispersion.iter().fold(back, |back, dispersion| back + dispersion.tr_mul(&last).column(0))
+    fn by_column(&self, pieces: &[Vec<usize>], weights: &DMatrix<f64>) -> DMatrix<f64> {
+        let said = self.factors.by_orbit(&slices(pieces), &weights.columns_range(..pieces.len()));
+        let Some(dispersion) = &self.dispersion else { return said };
+        let mut said = said.insert_row(pieces.len(), 0.0);
+        said.set_row(pieces.len(), &weights.column(pieces.len()).tr_mul(dispersion).row(0));
+        said
+    }
+
+    fn by_row(&self, pieces: &[Vec<usize>], weights: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut said = self.factors.by_observer(&slices(pieces), &weights.columns_range(..pieces.len()));
+        if let Some(dispersion) = &self.dispersion {
+            let last = weights.column(pieces.len());
+            said.column_iter_mut()
+                .zip(dispersion.column_iter())
+                .for_each(|(mut said, by)| said.cmpy(1.0, &by, &last, 1.0));
+        }
+        said
     }
 
     fn forward(&self, pieces: &[Vec<usize>], step: &DVector<f64>) -> DMatrix<f64> {

@@ -7,7 +7,7 @@ use crate::arrow::Arrow;
 use crate::data::residual;
 use crate::error::MeasuredError;
 use crate::model::{Model, Prediction};
-use crate::normal::{Normal, Places, in_widths, times};
+use crate::normal::{Places, in_widths, times};
 use crate::unknowns::Unknown;
 
 /// Steps of one descent; those of measured rings take 5 to 60.
@@ -111,15 +111,13 @@ impl Hill<'_> {
     /// Half the slope downhill, in widths.
     fn slope(&self, here: &Point) -> DVector<f64> {
         let weighted = residual(self.measured, &here.prediction, self.weight).component_mul(self.weight);
-        let back = self.places.back(&here.prediction, &weighted, self.width.len());
+        let back = self.places.back(&here.prediction, &weighted);
         back.component_mul(&self.width) - self.off(&here.values)
     }
 
     /// Half the curvature, in widths, and its factor; none where it is not positive.
     fn curvature(&self, here: &Point, apart: &[Vec<usize>]) -> Option<(DMatrix<f64>, Arrow)> {
-        let nothing = DMatrix::zeros(self.weight.nrows(), self.weight.ncols());
-        let normal = Normal::of(&self.places, &here.prediction, &nothing, self.weight, self.width.len());
-        let curvature = in_widths(normal.matrix, &self.width);
+        let curvature = in_widths(self.places.information(&here.prediction, self.weight), &self.width);
         let factor = Arrow::of(&curvature, apart)?;
         Some((curvature, factor))
     }

@@ -165,12 +165,12 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
 }
 
 /// Memory of a fit [bytes], roughly: 322 MB for a ring of 400 gradients, readings and kicks whose fit took 461. Of all unknowns eight square matrices at a
-/// time, of each lane of a sum the machine's columns, of two predictions some twenty matrices of the measured shape, and the factors of their derivatives.
+/// time, of each lane of a sum the machine's block, of two predictions some twenty matrices of the measured shape, and the factors of their derivatives.
 pub fn memory(unknowns: &[Unknown], (rows, columns): (usize, usize)) -> usize {
     let n = unknowns.len();
     let is_machine = |one: &&Unknown| one.kind.is_of_machine();
     let machine = unknowns.iter().filter(is_machine).count();
-    size_of::<f64>() * (8 * n * n + LANES * n * machine + 20 * rows * columns + 12 * rows * machine)
+    size_of::<f64>() * (8 * n * n + LANES * machine * machine + 20 * rows * columns + 12 * rows * machine)
 }
 
 /// Descend with what the model misses in each block, which is learnt in turn with the unknowns.
@@ -189,7 +189,8 @@ pub fn with_model_error(
     for round in 1..=ROUNDS {
         progress(&format!("error of the model, round {round} of {ROUNDS}"));
         let residual = data.residual(&here.prediction);
-        noise = noise.learnt(data, &places, &here.prediction, (&residual, &here.covariance));
+        let followed = noise.followed(data, &places, &here.prediction, (&residual, &here.covariance));
+        noise = noise.learnt(data, &residual, &followed);
         let weight = data.weight(&noise, &residual);
         here = descend(model, unknowns, &data.measured, &weight, (here.values, EXACT))?;
         steps += here.steps;

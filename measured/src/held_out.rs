@@ -8,7 +8,7 @@ use crate::error::MeasuredError;
 use crate::linear::Factor;
 use crate::model::Prediction;
 use crate::noise::Noise;
-use crate::normal::{Normal, Places, times};
+use crate::normal::{Places, times};
 
 /// Parts of the rows, and of the columns.
 const PARTS: usize = 3;
@@ -63,26 +63,27 @@ impl HeldOut {
         let residual = data.residual(prediction);
         let weight = data.weight(noise, &residual);
         let (rows, columns) = residual.shape();
-        let part = |count: usize, part: usize| (part..count).step_by(PARTS).collect::<Vec<usize>>();
-        let parts = (0..PARTS * PARTS).map(|number| [part(rows, number / PARTS), part(columns, number % PARTS)]);
-        let parts: Vec<[Vec<usize>; 2]> = parts.collect();
-        let n = width.len();
-        let normal = |part| Normal::of_part(places, prediction, (&residual, &weight), part, n);
-        let normals: Vec<Normal> = parts.iter().map(normal).collect();
-        let whole = normals.iter().fold(DMatrix::zeros(n, n), |sum, one| sum + &one.matrix);
-        let slope = normals.iter().fold(DVector::zeros(n), |sum, one| sum + &one.slope);
-        let (mut left, mut steps) = (residual.clone(), Vec::new());
-        for ([rows, columns], normal) in parts.iter().zip(&normals) {
-            let matrix = times(&whole - &normal.matrix, width) + *precision;
-            let slope = (&slope - &normal.slope).component_mul(width) - *pull;
+        let (mut left, mut steps, mut parts) = (residual.clone(), Vec::new(), Vec::new());
+        for part in 0..PARTS * PARTS {
+            let is_in = |row: usize, column: usize| row % PARTS == part / PARTS && column % PARTS == part % PARTS;
+            let weight =
+                DMatrix::from_fn(rows, columns, |row, column| f64::from(is_in(row, column)) * weight[(row, column)]);
+            let information = places.information(prediction, &weight);
+            parts.push((information, places.back(prediction, &weight.component_mul(&residual)), weight));
+        }
+        let whole = parts.iter().fold(DMatrix::zeros(width.len(), width.len()), |sum, part| sum + &part.0);
+        let slope = parts.iter().fold(DVector::zeros(width.len()), |sum, part| sum + &part.1);
+        for (information, own, weight) in &parts {
+            let matrix = times(&whole - information, width) + *precision;
+            let slope = (&slope - own).component_mul(width) - *pull;
             let step = Factor::of(&matrix).ok_or(MeasuredError::Singular(0))?.solve(&slope).component_mul(width);
             let moved = places.forward(prediction, &step);
             steps.push(step);
-            for &column in columns {
-                rows.iter()
-                    .filter(|&&row| weight[(row, column)] > 0.0)
-                    .for_each(|&row| left[(row, column)] -= moved[(row, column)]);
-            }
+            left.iter_mut()
+                .zip(&moved)
+                .zip(weight)
+                .filter(|(_, weight)| **weight > 0.0)
+                .for_each(|((left, moved), _)| *left -= moved);
         }
         left.zip_apply(&counted.sigma, |left, sigma| *left *= f64::from(sigma.is_finite()));
         let density = |column: usize| {

@@ -18,7 +18,7 @@ use crate::folder::{Folder, Row};
 use crate::linear::{Factor, inverse, product};
 use crate::model::{Model, Prediction};
 use crate::noise::Noise;
-use crate::normal::{Normal, Places, times};
+use crate::normal::{Places, times};
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
 
@@ -195,10 +195,10 @@ impl Hierarchy {
         let classes = unknowns.iter().map(|unknown| class(folder, &groups, unknown.kind)).collect();
         let data = Data::with_coupling(folder, &fitted.outliers);
         let prediction = model.predict(&unknowns, &values)?;
-        let (places, n) = (Places::of(&unknowns, data.measured.nrows(), data.measured.ncols()), values.len());
+        let residual = data.residual(&prediction);
         // what follows the data is not known yet
-        let nothing = DMatrix::zeros(n, n);
-        let noise = fitted.noise.learnt(&data, &places, &prediction, (&data.residual(&prediction), &nothing));
+        let nothing = DMatrix::zeros(residual.nrows(), residual.ncols());
+        let noise = fitted.noise.learnt(&data, &residual, &nothing);
         let start = Start { data, groups, unknowns, values, classes, families, noise };
         start.settle(&model, ROUNDS, progress)
     }
@@ -370,7 +370,7 @@ impl Start {
         let places = Places::of(&self.unknowns, rows, columns);
         let scene = Scene { model, places, width: each(|one| one.width), mean: each(|one| one.mean) };
         let mut prediction = model.predict(&self.unknowns, &self.values)?;
-        let mut damping = DAMPING;
+        let (mut damping, mut followed) = (DAMPING, DMatrix::zeros(0, 0));
         for round in 1..=rounds {
             progress(&format!("families, round {round} of {rounds}"));
             let here = self.linearise(&scene, &prediction);
@@ -381,8 +381,13 @@ impl Start {
             for family in &mut self.families {
                 family.mean += family.deviations(&posterior.values, &posterior.covariance).mean;
             }
-            let (left, covariance) = (self.data.residual(&prediction), times(posterior.covariance, &scene.width));
-            self.noise = self.noise.learnt(&self.data, &scene.places, &prediction, (&left, &covariance));
+            let left = self.data.residual(&prediction);
+            // what the unknowns follow of an element changes with the families' scales, and little with the size of the errors
+            if round == 1 || gained > SETTLED {
+                let covariance = times(posterior.covariance, &scene.width);
+                followed = self.noise.followed(&self.data, &scene.places, &prediction, (&left, &covariance));
+            }
+            self.noise = self.noise.learnt(&self.data, &left, &followed);
             if gained + promised < SETTLED {
                 break;
             }
@@ -414,11 +419,11 @@ impl Start {
         let n = self.unknowns.len();
         let residual = self.data.residual(prediction);
         let weight = self.data.weight(&self.noise, &residual);
-        let normal = Normal::of(&scene.places, prediction, &residual, &weight, n);
+        let slope = scene.places.back(prediction, &weight.component_mul(&residual));
         let expected = &scene.mean + means(&self.families, n).component_mul(&scene.width);
         Linearised {
-            information: times(normal.matrix, &scene.width),
-            slope: normal.slope.component_mul(&scene.width),
+            information: times(scene.places.information(prediction, &weight), &scene.width),
+            slope: slope.component_mul(&scene.width),
             off: (&self.values - &expected).component_div(&scene.width),
             residual,
             weight,

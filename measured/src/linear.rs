@@ -90,6 +90,16 @@ fn of_columns(
     DMatrix::from_vec(rows, right.ncols(), lanes.concat())
 }
 
+/// `A L` with the lower triangle of a matrix.
+pub fn lower_product(left: &DMatrix<f64>, lower: &DMatrix<f64>) -> DMatrix<f64> {
+    let (rows, columns) = (left.nrows(), lower.ncols());
+    let mut made = DMatrix::zeros(rows, columns);
+    let into = MatMut::from_column_major_slice_mut(made.as_mut_slice(), rows, columns);
+    let [all, triangle] = [triangular::BlockStructure::Rectangular, triangular::BlockStructure::TriangularLower];
+    triangular::matmul(into, all, Accum::Replace, view(left), all, view(lower), triangle, 1.0, Par::Seq);
+    made
+}
+
 /// Add `A^T A` to the lower triangle of the first rows of a matrix with as many columns as `A`.
 pub fn add_square(factor: &DMatrix<f64>, into: &mut DMatrix<f64>) {
     let (rows, n) = into.shape();
@@ -123,6 +133,7 @@ mod tests {
             assert!((factor.log_root() - log_root).abs() < 1e-9 * (1.0 + log_root), "{n}");
             assert!((product(&root, &matrix) - &root * &matrix).amax() < 1e-9 * matrix.amax(), "{n}");
             assert!((transposed_product(&root, &root) - root.transpose() * &root).amax() < 1e-9, "{n}");
+            assert!((lower_product(&root, &matrix) - &root * matrix.lower_triangle()).amax() < 1e-9 * matrix.amax());
             let mut square = DMatrix::zeros(n + 2, n);
             add_square(&root, &mut square);
             let lower = square.rows(0, n).lower_triangle() - (root.transpose() * &root).lower_triangle();

@@ -44,19 +44,22 @@ impl Noise {
         Self { monitors: vec![1.0; self.monitors.len()], ..self.clone() }
     }
 
-    /// From residuals [mm] that are as large as the errors that they are left of: unknowns of some covariance follow each element with a share `h` of it, its weight
-    /// times the variance that their covariance gives it, and leave `1 - h` of its variance.
+    /// Share `h` of each element's error that unknowns of some covariance follow: its weight times the variance that their covariance gives it.
     ///
     /// Source: D. A. Belsley, E. Kuh and R. E. Welsch, Regression Diagnostics (1980), eq. 2.15.
-    pub fn learnt(
+    pub fn followed(
         &self,
         data: &Data,
         places: &Places,
         prediction: &Prediction,
         (residual, covariance): (&DMatrix<f64>, &DMatrix<f64>),
-    ) -> Self {
-        let followed = places.variance(prediction, covariance).component_mul(&data.weight(self, residual));
-        let errors = residual.zip_map(&followed, |left, followed| left / (1.0 - followed).max(LEAST_LEFT).sqrt());
+    ) -> DMatrix<f64> {
+        places.variance(prediction, covariance).component_mul(&data.weight(self, residual))
+    }
+
+    /// From residuals [mm] of which unknowns have followed a share `h`: `1 - h` of the variance is left.
+    pub fn learnt(&self, data: &Data, residual: &DMatrix<f64>, followed: &DMatrix<f64>) -> Self {
+        let errors = residual.zip_map(followed, |left, followed| left / (1.0 - followed).max(LEAST_LEFT).sqrt());
         self.clone().with_errors(data, &errors)
     }
 

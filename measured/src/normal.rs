@@ -4,23 +4,16 @@
 
 use core::ops::AddAssign;
 
-use nalgebra::{Const, DMatrix, DMatrixView, DVector, Dyn};
+use nalgebra::{DMatrix, DVector};
 
 use crate::error::MeasuredError;
-use crate::linear::{add_square, in_lanes, inverse, product};
+use crate::linear::{add_square, in_lanes, inverse, lower_product};
 use crate::model::Prediction;
 use crate::unknowns::{Kind, Unknown};
 
-/// `J^T W J`, `J^T W r` and `r^T W r` of the elements of a matrix.
-pub struct Normal {
-    /// `J^T W J`.
-    pub matrix: DMatrix<f64>,
-    /// `J^T W r`.
-    pub slope: DVector<f64>,
-}
-
 /// Where the unknowns of each row and column stand.
 pub struct Places {
+    unknowns: usize,
     machine: usize,
     rows: Vec<[Option<usize>; 2]>,
     columns: Vec<[Option<usize>; 2]>,
@@ -29,7 +22,8 @@ pub struct Places {
 impl Places {
     /// Of the unknowns, those of the machine first, and the shape of the matrix; the RF scale stands for a corrector of the last column.
     pub fn of(unknowns: &[Unknown], rows: usize, columns: usize) -> Self {
-        let mut places = Self { machine: 0, rows: vec![[None; 2]; rows], columns: vec![[None; 2]; columns] };
+        let none = |lines: usize| vec![[None; 2]; lines];
+        let mut places = Self { unknowns: unknowns.len(), machine: 0, rows: none(rows), columns: none(columns) };
         for (at, unknown) in unknowns.iter().enumerate() {
             match unknown.kind {
                 Kind::Strength(_)
@@ -71,36 +65,109 @@ impl Places {
     }
 
     /// `J^T` of weighted elements.
-    pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>, unknowns: usize) -> DVector<f64> {
-        let mut back = DVector::zeros(unknowns);
-        back.rows_mut(0, self.machine).copy_from(&at.by_machine.back(weighted));
-        for column in 0..weighted.ncols() {
-            for row in (0..weighted.nrows()).filter(|&row| weighted[(row, column)] != 0.0) {
-                for (one, by) in self.instruments(at, row, column) {
-                    back[one] += by * weighted[(row, column)];
-                }
+    pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>) -> DVector<f64> {
+        let mut back = DVector::zeros(self.unknowns);
+        back.rows_mut(0, self.machine).copy_from(&at.by_machine.by_column(weighted).row_sum_tr());
+        for (row, column) in places_of(weighted) {
+            for (one, by) in self.instruments(at, row, column) {
+                back[one] += by * weighted[(row, column)];
             }
         }
         back
     }
 
+    /// The same of each row, then of each column, one after the other.
+    pub fn back_by_lines(&self, at: &Prediction, weighted: &DMatrix<f64>) -> DMatrix<f64> {
+        let (rows, columns) = weighted.shape();
+        let mut back = DMatrix::zeros(self.unknowns, rows + columns);
+        back.view_mut((0, 0), (self.machine, rows)).tr_copy_from(&at.by_machine.by_row(weighted));
+        back.view_mut((0, rows), (self.machine, columns)).tr_copy_from(&at.by_machine.by_column(weighted));
+        for (row, column) in places_of(weighted) {
+            for (one, by) in self.instruments(at, row, column) {
+                back[(one, row)] += by * weighted[(row, column)];
+                back[(one, rows + column)] += by * weighted[(row, column)];
+            }
+        }
+        back
+    }
+
+    /// What the elements say of the unknowns, `J^T W J`, each with its weight.
+    pub fn information(&self, at: &Prediction, weight: &DMatrix<f64>) -> DMatrix<f64> {
+        let (rows, columns) = weight.shape();
+        let mut information = DMatrix::zeros(self.unknowns, self.unknowns);
+        for lane in
+            in_lanes(&every(columns), weight.len() * self.machine.pow(2), |columns| self.square(at, weight, columns))
+        {
+            information.view_mut((0, 0), (self.machine, self.machine)).add_assign(&lane);
+        }
+        let with_machine = in_lanes(&[0, 1], weight.len() * self.machine, |which| {
+            let which = which[0];
+            let by_row = at.by_machine.by_row(&weight.component_mul(&at.by_monitor[which]));
+            (which, by_row, at.by_machine.by_column(&weight.component_mul(&at.by_corrector[which])))
+        });
+        for (which, by_row, by_column) in with_machine {
+            let of_rows = (0..rows).map(|row| (self.rows[row][which], by_row.row(row)));
+            let of_columns = (0..columns).map(|column| (self.columns[column][which], by_column.row(column)));
+            for (place, said) in of_rows.chain(of_columns) {
+                place.iter().for_each(|&place| information.view_mut((place, 0), (1, self.machine)).copy_from(&said));
+            }
+        }
+        information.fill_upper_triangle_with_lower_triangle();
+        let mut each = Vec::new();
+        for (row, column) in places_of(weight) {
+            each.clear();
+            each.extend(self.instruments(at, row, column));
+            for &(one, by) in &each {
+                each.iter()
+                    .for_each(|&(other, by_other)| information[(one, other)] += weight[(row, column)] * by * by_other);
+            }
+        }
+        information
+    }
+
+    /// Lower triangle of the block of the machine's unknowns, by some columns.
+    fn square(&self, at: &Prediction, weight: &DMatrix<f64>, columns: &[usize]) -> DMatrix<f64> {
+        let (rows, mut square) = (weight.nrows(), DMatrix::zeros(self.machine, self.machine));
+        for columns in columns.chunks(DEEP.div_ceil(rows)) {
+            let roots =
+                columns.iter().flat_map(|&column| weight.column(column).into_iter().map(|weight| weight.sqrt()));
+            let roots = DVector::from_iterator(columns.len() * rows, roots);
+            let by_machine = at.by_machine.weighted(columns, &roots);
+            let counted: Vec<usize> = (0..roots.len()).filter(|&element| roots[element] > 0.0).collect();
+            if counted.len() < roots.len() / 2 {
+                add_square(&by_machine.select_rows(&counted), &mut square);
+            } else {
+                add_square(&by_machine, &mut square);
+            }
+        }
+        square
+    }
+
     /// `J` times a step of the unknowns.
     pub fn forward(&self, at: &Prediction, step: &DVector<f64>) -> DMatrix<f64> {
         let mut moved = at.by_machine.forward(&step.rows(0, self.machine).into_owned());
-        for (row, column) in (0..moved.ncols()).flat_map(|column| (0..at.matrix.nrows()).map(move |row| (row, column)))
-        {
-            moved[(row, column)] += self.instruments(at, row, column).map(|(one, by)| by * step[one]).sum::<f64>();
+        for (column, mut moved) in moved.column_iter_mut().enumerate() {
+            for (row, moved) in moved.iter_mut().enumerate() {
+                *moved += self.instruments(at, row, column).map(|(one, by)| by * step[one]).sum::<f64>();
+            }
         }
         moved
     }
 
     /// `J C J^T` of each element by itself: the variance that a covariance of the unknowns gives it.
     pub fn variance(&self, at: &Prediction, covariance: &DMatrix<f64>) -> DMatrix<f64> {
-        let of_machine = covariance.view((0, 0), (self.machine, self.machine)).into_owned();
+        let mut of_machine = covariance.view((0, 0), (self.machine, self.machine)).into_owned();
+        // J C J^T is twice that of a triangle with half the diagonal
+        (0..self.machine).for_each(|one| of_machine[(one, one)] *= 0.5);
+        // of each row's monitor, its covariance with the machine
+        let of_monitors = [0, 1].map(|which| {
+            DMatrix::from_fn(at.matrix.nrows(), self.machine, |row, unknown| {
+                self.rows[row][which].map_or(0.0, |place| covariance[(place, unknown)])
+            })
+        });
         let lanes = in_lanes(&every(at.matrix.ncols()), at.matrix.len() * self.machine.pow(2), |columns| {
-            columns
-                .iter()
-                .map(|&column| self.variance_of_column(at, column, (covariance, &of_machine)))
+            let each = columns.iter();
+            each.map(|&column| self.variance_of_column(at, column, covariance, (&of_machine, &of_monitors)))
                 .collect::<Vec<_>>()
         });
         DMatrix::from_columns(&lanes.concat())
@@ -110,170 +177,48 @@ impl Places {
         &self,
         at: &Prediction,
         column: usize,
-        (covariance, of_machine): (&DMatrix<f64>, &DMatrix<f64>),
+        covariance: &DMatrix<f64>,
+        (of_machine, of_monitors): (&DMatrix<f64>, &[DMatrix<f64>; 2]),
     ) -> DVector<f64> {
         let by_machine = at.by_machine.columns(&[column]);
-        let mut spread = product(&by_machine, of_machine);
-        let mut variance = DVector::zeros(by_machine.nrows());
-        let each: Vec<Vec<_>> =
-            (0..by_machine.nrows()).map(|row| self.instruments(at, row, column).collect()).collect();
-        for (row, instruments) in each.iter().enumerate() {
-            for &(one, by_one) in instruments {
-                variance[row] +=
-                    by_one * instruments.iter().map(|&(other, by)| by * covariance[(one, other)]).sum::<f64>();
+        let mut variance = row_products(&lower_product(&by_machine, of_machine), &by_machine);
+        for (of_monitors, by) in of_monitors.iter().zip(&at.by_monitor) {
+            variance.cmpy(1.0, &row_products(&by_machine, of_monitors), &by.column(column), 1.0);
+        }
+        for (place, by) in self.columns[column].iter().zip(&at.by_corrector) {
+            let Some(place) = *place else { continue };
+            let with_machine = &by_machine * covariance.view((0, place), (self.machine, 1)).column(0);
+            variance.cmpy(1.0, &with_machine, &by.column(column), 1.0);
+        }
+        variance *= 2.0;
+        for (row, variance) in variance.iter_mut().enumerate() {
+            let instruments: Vec<(usize, f64)> = self.instruments(at, row, column).collect();
+            for &(one, by_one) in &instruments {
+                *variance += by_one * instruments.iter().map(|&(other, by)| by * covariance[(one, other)]).sum::<f64>();
             }
         }
-        for (unknown, mut spread) in spread.column_iter_mut().enumerate() {
-            let across = covariance.column(unknown);
-            for (spread, instruments) in spread.iter_mut().zip(&each) {
-                *spread += 2.0 * instruments.iter().map(|&(one, by)| by * across[one]).sum::<f64>();
-            }
-        }
-        variance + spread.component_mul(&by_machine).column_sum()
+        variance
     }
 }
 
-fn every(count: usize) -> Vec<usize> {
-    (0..count).collect()
+/// Product of each row with that of another matrix.
+fn row_products(one: &DMatrix<f64>, other: &DMatrix<f64>) -> DVector<f64> {
+    let mut products = DVector::zeros(one.nrows());
+    one.column_iter().zip(other.column_iter()).for_each(|(one, other)| products.cmpy(1.0, &one, &other, 1.0));
+    products
 }
 
-/// Derivatives of the elements of one column, among those of others.
-type Said<'d> = DMatrixView<'d, f64, Const<1>, Dyn>;
-
-/// What some columns say of the machine.
-struct OfMachine {
-    /// Columns of `J^T W J` of the machine's unknowns, of their own block the lower triangle.
-    left: DMatrix<f64>,
-    /// `J^T W r` of these.
-    slope: DVector<f64>,
-}
-
-impl Normal {
-    /// With `residual` measured less predicted and `weight` one over its variance, 0 where an element does not count.
-    pub fn of(
-        places: &Places,
-        at: &Prediction,
-        residual: &DMatrix<f64>,
-        weight: &DMatrix<f64>,
-        unknowns: usize,
-    ) -> Self {
-        let (rows, columns) = residual.shape();
-        Self::of_part(places, at, (residual, weight), &[every(rows), every(columns)], unknowns)
-    }
-
-    /// The same of some rows and columns alone.
-    pub fn of_part(
-        places: &Places,
-        at: &Prediction,
-        data: (&DMatrix<f64>, &DMatrix<f64>),
-        [rows, columns]: &[Vec<usize>; 2],
-        unknowns: usize,
-    ) -> Self {
-        let work = rows.len() * columns.len() * places.machine.pow(2);
-        let lanes =
-            in_lanes(columns, work, |columns| OfMachine::of_columns(places, at, data, (rows, columns), unknowns));
-        let mut normal = Self { matrix: DMatrix::zeros(unknowns, unknowns), slope: DVector::zeros(unknowns) };
-        for lane in lanes {
-            normal.matrix.columns_mut(0, places.machine).add_assign(&lane.left);
-            normal.slope.rows_mut(0, places.machine).add_assign(&lane.slope);
-        }
-        normal.matrix.fill_upper_triangle_with_lower_triangle();
-        normal.add_instruments(places, at, data, (rows, columns));
-        normal
-    }
-
-    /// Add what the elements say of the instruments alone.
-    fn add_instruments(
-        &mut self,
-        places: &Places,
-        at: &Prediction,
-        (residual, weight): (&DMatrix<f64>, &DMatrix<f64>),
-        (rows, columns): (&[usize], &[usize]),
-    ) {
-        let mut each = Vec::new();
-        for (row, column) in columns.iter().flat_map(|&column| rows.iter().map(move |&row| (row, column))) {
-            let (w, r) = (weight[(row, column)], residual[(row, column)]);
-            if w <= 0.0 {
-                continue;
-            }
-            each.clear();
-            each.extend(places.instruments(at, row, column));
-            for &(one, by) in &each {
-                self.slope[one] += w * by * r;
-                each.iter().for_each(|&(other, by_other)| self.matrix[(one, other)] += w * by * by_other);
-            }
-        }
-    }
+/// Places of the elements that count.
+fn places_of(weights: &DMatrix<f64>) -> impl Iterator<Item = (usize, usize)> + '_ {
+    let all = (0..weights.ncols()).flat_map(|column| (0..weights.nrows()).map(move |row| (row, column)));
+    all.filter(|&place| weights[place] != 0.0)
 }
 
 /// Elements whose derivatives are multiplied at once: fewer leave the processor waiting for memory.
 const DEEP: usize = 512;
 
-impl OfMachine {
-    fn of_columns(
-        places: &Places,
-        at: &Prediction,
-        data: (&DMatrix<f64>, &DMatrix<f64>),
-        (rows, columns): (&[usize], &[usize]),
-        unknowns: usize,
-    ) -> Self {
-        let machine = places.machine;
-        let mut sum = Self { left: DMatrix::zeros(unknowns, machine), slope: DVector::zeros(machine) };
-        let every = at.matrix.nrows();
-        let mut of_monitors = [0, 1].map(|_| DMatrix::zeros(every, machine));
-        for columns in columns.chunks(DEEP.div_ceil(every)) {
-            let by_machine = at.by_machine.columns(columns);
-            let depth = rows.len() * columns.len();
-            let mut deep = DMatrix::zeros(depth, machine);
-            for (number, &column) in columns.iter().enumerate() {
-                let by_machine = by_machine.rows(number * every, every);
-                let mut weights = DVector::zeros(every);
-                rows.iter().for_each(|&row| weights[row] = data.1[(row, column)]);
-                sum.add_column(places, at, (data.0, &weights), column, &by_machine);
-                for (sum, by_monitor) in of_monitors.iter_mut().zip(&at.by_monitor) {
-                    add_times(&by_machine, &weights.component_mul(&by_monitor.column(column)), sum);
-                }
-                let roots: Vec<(usize, f64)> = rows.iter().map(|&row| (row, weights[row].sqrt())).collect();
-                for (line, by) in deep.as_mut_slice().chunks_exact_mut(depth).zip(by_machine.column_iter()) {
-                    let line = &mut line[number * rows.len()..];
-                    line.iter_mut().zip(&roots).for_each(|(into, &(row, root))| *into = by[row] * root);
-                }
-            }
-            add_square(&deep, &mut sum.left);
-        }
-        for (which, of_monitors) in of_monitors.iter().enumerate() {
-            for (row, said) in of_monitors.row_iter().enumerate() {
-                if let Some(place) = places.rows[row][which] {
-                    sum.left.set_row(place, &said);
-                }
-            }
-        }
-        sum
-    }
-
-    /// Slopes, and what stands between machine and correctors.
-    fn add_column(
-        &mut self,
-        places: &Places,
-        at: &Prediction,
-        (residual, weights): (&DMatrix<f64>, &DVector<f64>),
-        column: usize,
-        by_machine: &Said,
-    ) {
-        self.slope.gemv_tr(1.0, by_machine, &weights.component_mul(&residual.column(column)), 1.0);
-        for (place, by) in places.columns[column].iter().zip(&at.by_corrector) {
-            let Some(place) = *place else { continue };
-            let said = by_machine.tr_mul(&weights.component_mul(&by.column(column)));
-            self.left.row_mut(place).add_assign(&said.transpose());
-        }
-    }
-}
-
-/// Add the columns of a matrix, each row times its weight.
-fn add_times(matrix: &Said, weights: &DVector<f64>, sum: &mut DMatrix<f64>) {
-    for (sum, column) in sum.as_mut_slice().chunks_exact_mut(weights.len()).zip(matrix.column_iter()) {
-        sum.iter_mut().zip(&column).zip(weights.as_slice()).for_each(|((sum, one), weight)| *sum += one * weight);
-    }
+fn every(count: usize) -> Vec<usize> {
+    (0..count).collect()
 }
 
 /// An information matrix in units of the priors' widths, with the priors.

@@ -48,7 +48,7 @@ impl<'f> Held<'f> {
         let places = Places::of(unknowns, at.matrix.nrows(), at.matrix.ncols());
         let residual = data.residual(at);
         let weighted = data.precision(noise).component_mul(&residual);
-        let mut slope = places.back(at, &weighted, unknowns.len());
+        let mut slope = places.back(at, &weighted);
         for ((slope, unknown), value) in slope.iter_mut().zip(unknowns).zip(values) {
             *slope += (unknown.mean - value) / unknown.width.powi(2);
         }

@@ -19,7 +19,7 @@ use crate::error::MeasuredError;
 use crate::linear::{product, transposed_product};
 use crate::model::Prediction;
 use crate::noise::Noise;
-use crate::normal::{Normal, Places, covariance};
+use crate::normal::{Places, covariance};
 use crate::unknowns::Unknown;
 
 /// Of the unknowns of a fit.
@@ -47,8 +47,7 @@ impl Uncertainty {
     pub fn of(unknowns: &[Unknown], at: &Prediction, data: &Data, noise: &Noise) -> Result<Self, MeasuredError> {
         let residual = data.residual(at);
         let places = Places::of(unknowns, residual.nrows(), residual.ncols());
-        let nothing = DMatrix::zeros(residual.nrows(), residual.ncols());
-        let information = Normal::of(&places, at, &nothing, &data.information(noise), unknowns.len()).matrix;
+        let information = places.information(at, &data.information(noise));
         let independent = covariance(unknowns, information.clone())?;
         Ok(Self::about((&places, at), (independent, information), (data, noise)))
     }
@@ -61,9 +60,8 @@ impl Uncertainty {
     ) -> Self {
         let (residual, n) = (data.residual(at), independent.nrows());
         let slope = data.weight(noise, &residual).component_mul(&residual);
-        let nothing = DMatrix::zeros(slope.nrows(), slope.ncols());
-        let together = together(places, at, &slope, n);
-        let alone = Normal::of(places, at, &nothing, &slope.component_mul(&slope), n).matrix;
+        let together = places.back_by_lines(at, &slope);
+        let alone = places.information(at, &slope.component_mul(&slope));
         let [sigma, of_data] = [DVector::zeros(n), DVector::zeros(n)];
         let mut all = Self { independent, sigma, together, alone, information, of_data };
         let of_lines = transposed_product(&all.together, &all.independent);
@@ -129,28 +127,6 @@ impl Marginal {
 /// From the sums of squares over lines and over elements, what independent errors of the learnt size make, and the whole variance with these.
 fn variance(lines: f64, elements: f64, of_data: f64, independent: f64) -> f64 {
     (lines - elements).max(elements).max(of_data) + independent - of_data
-}
-
-/// What each row, then each column says of the unknowns, `J^T s`.
-fn together(places: &Places, at: &Prediction, slope: &DMatrix<f64>, unknowns: usize) -> DMatrix<f64> {
-    let (rows, columns) = slope.shape();
-    let mut together = DMatrix::zeros(unknowns, rows + columns);
-    for column in 0..columns {
-        let mut said = at.by_machine.columns(&[column]);
-        for (unknown, mut said) in said.column_iter_mut().enumerate() {
-            said.component_mul_assign(&slope.column(column));
-            together[(unknown, rows + column)] = said.sum();
-        }
-        let mut of_rows = together.view_mut((0, 0), (said.ncols(), rows));
-        of_rows += said.transpose();
-    }
-    for (row, column) in (0..columns).flat_map(|column| (0..rows).map(move |row| (row, column))) {
-        for (unknown, by) in places.instruments(at, row, column) {
-            together[(unknown, row)] += by * slope[(row, column)];
-            together[(unknown, rows + column)] += by * slope[(row, column)];
-        }
-    }
-    together
 }
 
 #[cfg(test)]

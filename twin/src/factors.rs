@@ -6,7 +6,9 @@
 //!
 //! as in [`Optics::response_jacobian`], whose matrices these are.
 
-use nalgebra::{DMatrix, DMatrixView, DMatrixViewMut, DVector, Matrix6, Matrix6xX, RowVector6, Vector6};
+use core::array;
+
+use nalgebra::{DMatrix, DMatrixView, DVector, Matrix6, RowVector6, Vector6};
 
 use crate::response::{Gradient, Observer, Optics, Place, Source, seen_rows};
 
@@ -56,42 +58,55 @@ impl ResponseFactors {
 
     /// Derivatives of some orbits by a gradient, of all observers in turn for each orbit; an orbit may have several sources.
     pub fn orbits(&self, orbits: &[&[usize]], gradient: usize, into: &mut [f64]) {
-        let mut sent = Matrix6xX::zeros(orbits.len());
-        for (mut sent, sources) in sent.column_iter_mut().zip(orbits) {
-            sent.copy_from(&self.sent_by(sources, gradient));
-        }
-        let mut into = DMatrixViewMut::from_slice(into, self.observers.len(), orbits.len());
-        into.gemm(1.0, &self.seen.columns(6 * gradient, 6), &sent, 0.0);
-        for (mut orbit, sources) in into.column_iter_mut().zip(orbits) {
+        let count = self.observers.len();
+        let [a, b, c, d, e, f] = array::from_fn(|sixth| self.seen.column(6 * gradient + sixth).data.into_slice());
+        for (orbit, sources) in into.chunks_exact_mut(count).zip(orbits) {
+            let sent: [f64; 6] = self.sent_by(sources, gradient).into();
+            let seen = a.iter().zip(b).zip(c).zip(d).zip(e).zip(f);
+            for (orbit, (((((a, b), c), d), e), f)) in orbit.iter_mut().zip(seen) {
+                *orbit = a * sent[0] + b * sent[1] + c * sent[2] + d * sent[3] + e * sent[4] + f * sent[5];
+            }
             for within in sources.iter().filter_map(|&source| self.within(source, gradient)) {
                 orbit.iter_mut().zip(within).for_each(|(orbit, within)| *orbit -= within);
             }
         }
     }
 
-    /// `sum_ij w_ij dG_ij/dk` of each gradient `k`, with weights of all observers, the rows, and orbits, the columns: one product, without a derivative.
-    pub fn back(&self, orbits: &[&[usize]], weights: &DMatrixView<f64>) -> DVector<f64> {
+    /// `sum_i w_ij dG_ij/dk` of each orbit `j`, rows, and gradient `k`, columns, with weights of all observers, the rows, and orbits, the columns: one product,
+    /// without a derivative.
+    pub fn by_orbit(&self, orbits: &[&[usize]], weights: &DMatrixView<f64>) -> DMatrix<f64> {
         let through = weights.transpose() * &self.seen;
-        DVector::from_fn(self.count(), |gradient, _| {
-            let said = |(orbit, sources): (usize, &&[usize])| {
-                let weights = weights.column(orbit);
-                let within = sources.iter().filter_map(|&source| self.within(source, gradient));
-                let within = within.flat_map(|within| within.zip(&weights)).map(|(within, weight)| within * weight);
-                let within: f64 = within.sum();
-                (through.fixed_view::<1, 6>(orbit, 6 * gradient) * self.sent_by(sources, gradient))[0] - within
-            };
-            orbits.iter().enumerate().map(said).sum()
+        DMatrix::from_fn(orbits.len(), self.count(), |orbit, gradient| {
+            let weights = weights.column(orbit);
+            let within = orbits[orbit].iter().filter_map(|&source| self.within(source, gradient));
+            let within = within.flat_map(|within| within.zip(&weights)).map(|(within, weight)| within * weight);
+            let within: f64 = within.sum();
+            (through.fixed_view::<1, 6>(orbit, 6 * gradient) * self.sent_by(orbits[orbit], gradient))[0] - within
         })
+    }
+
+    /// `sum_j w_ij dG_ij/dk` of each observer `i`, rows, and gradient `k`, columns, likewise.
+    pub fn by_observer(&self, orbits: &[&[usize]], weights: &DMatrixView<f64>) -> DMatrix<f64> {
+        let through = weights * self.sent(orbits).transpose();
+        let mut said = DMatrix::from_fn(self.observers.len(), self.count(), |observer, gradient| {
+            let seen = self.seen.fixed_view::<1, 6>(observer, 6 * gradient);
+            seen.dot(&through.fixed_view::<1, 6>(observer, 6 * gradient))
+        });
+        for (gradient, mut said) in said.column_iter_mut().enumerate() {
+            for (weights, sources) in weights.column_iter().zip(orbits) {
+                for within in sources.iter().filter_map(|&source| self.within(source, gradient)) {
+                    said.iter_mut().zip(within).zip(&weights).for_each(|((said, one), weight)| *said -= one * weight);
+                }
+            }
+        }
+        said
     }
 
     /// `sum_k dG_ij/dk t_k` of all observers, the rows, and orbits, the columns, with a step of each gradient: one product, without a derivative.
     pub fn forward(&self, orbits: &[&[usize]], step: &DVector<f64>) -> DMatrix<f64> {
-        let mut sent = DMatrix::zeros(self.seen.ncols(), orbits.len());
-        for (orbit, gradient) in
-            (0..orbits.len()).flat_map(|orbit| (0..step.len()).map(move |gradient| (orbit, gradient)))
-        {
-            let one = self.sent_by(orbits[orbit], gradient) * step[gradient];
-            sent.fixed_view_mut::<6, 1>(6 * gradient, orbit).copy_from(&one);
+        let mut sent = self.sent(orbits);
+        for (gradient, step) in step.iter().enumerate() {
+            sent.rows_mut(6 * gradient, 6).scale_mut(*step);
         }
         let mut moved = &self.seen * sent;
         for (mut orbit, sources) in moved.column_iter_mut().zip(orbits) {
@@ -102,6 +117,17 @@ impl ResponseFactors {
             }
         }
         moved
+    }
+
+    /// What each orbit's sources send to all gradients, six rows a gradient.
+    fn sent(&self, orbits: &[&[usize]]) -> DMatrix<f64> {
+        let mut sent = DMatrix::zeros(self.seen.ncols(), orbits.len());
+        for (mut sent, sources) in sent.column_iter_mut().zip(orbits) {
+            for gradient in 0..self.count() {
+                sent.fixed_rows_mut::<6>(6 * gradient).copy_from(&self.sent_by(sources, gradient));
+            }
+        }
+        sent
     }
 
     /// What some sources send to a gradient.
@@ -152,7 +178,8 @@ mod tests {
         let orbits: Vec<Vec<usize>> = (0..sources.len() - 1).map(|first| vec![first, first + 1]).collect();
         let orbits: Vec<&[usize]> = orbits.iter().map(Vec::as_slice).collect();
         let weights = DMatrix::from_fn(observers.len(), orbits.len(), |i, j| (1.0 + (3 * i + 7 * j) as f64).sin());
-        let back = factors.back(&orbits, &weights.as_view());
+        let by_orbit = factors.by_orbit(&orbits, &weights.as_view());
+        let by_observer = factors.by_observer(&orbits, &weights.as_view());
         let step = DVector::from_fn(gradients.len(), |i, _| (1.0 + i as f64).cos());
         let mut moved = factors.forward(&orbits, &step);
         for (gradient, matrix) in matrices.iter().enumerate() {
@@ -160,7 +187,11 @@ mod tests {
             let mut made = DMatrix::zeros(observers.len(), orbits.len());
             factors.orbits(&orbits, gradient, made.as_mut_slice());
             assert!((made - &exact).amax() < 1e-12 * matrix.amax(), "{gradient}: rounding");
-            assert!((back[gradient] - weights.dot(&exact)).abs() < 1e-12 * matrix.norm(), "{gradient}: rounding");
+            let weighted = weights.component_mul(&exact);
+            let off = (by_orbit.column(gradient) - weighted.row_sum_tr()).amax();
+            assert!(off < 1e-12 * matrix.norm(), "{gradient}: rounding");
+            let off = (by_observer.column(gradient) - weighted.column_sum()).amax();
+            assert!(off < 1e-12 * matrix.norm(), "{gradient}: rounding");
             moved -= exact * step[gradient];
         }
         assert!(moved.amax() < 1e-11 * matrices.iter().map(|one| one.amax()).fold(0.0, f64::max), "rounding");
