@@ -114,8 +114,9 @@ impl Start {
 const CERTAIN: f64 = 4.0;
 /// Noise from a few repeats is known to such a factor.
 const KNOWN: f64 = 1.5;
-/// Rounds of the model's error.
+/// Rounds of the model's error at most; the last one changes the residuals' probability by less than this [nat].
 const ROUNDS: usize = 6;
+const SETTLED: f64 = 0.01;
 
 /// Fit a measurement.
 ///
@@ -190,10 +191,14 @@ pub fn with_model_error(
         progress(&format!("error of the model, round {round} of {ROUNDS}"));
         let residual = data.residual(&here.prediction);
         let followed = noise.followed(data, &places, &here.prediction, (&residual, &here.covariance));
-        noise = noise.learnt(data, &residual, &followed);
+        let gained;
+        (noise, gained) = noise.learnt(data, &residual, &followed);
         let weight = data.weight(&noise, &residual);
         here = descend(model, unknowns, &data.measured, &weight, (here.values, EXACT))?;
         steps += here.steps;
+        if gained.abs() < SETTLED {
+            break;
+        }
     }
     let uncertainty = Uncertainty::of(unknowns, &here.prediction, data, &noise)?;
     Ok(Learnt { here: Descent { steps, ..here }, noise, uncertainty })

@@ -198,7 +198,7 @@ impl Hierarchy {
         let residual = data.residual(&prediction);
         // what follows the data is not known yet
         let nothing = DMatrix::zeros(residual.nrows(), residual.ncols());
-        let noise = fitted.noise.learnt(&data, &residual, &nothing);
+        let (noise, _) = fitted.noise.learnt(&data, &residual, &nothing);
         let start = Start { data, groups, unknowns, values, classes, families, noise };
         start.settle(&model, ROUNDS, progress)
     }
@@ -383,11 +383,11 @@ impl Start {
             }
             let left = self.data.residual(&prediction);
             // what the unknowns follow of an element changes with the families' scales, and little with the size of the errors
-            if round == 1 || gained > SETTLED {
+            if round == 1 || gained > 0.0 {
                 let covariance = times(posterior.covariance, &scene.width);
                 followed = self.noise.followed(&self.data, &scene.places, &prediction, (&left, &covariance));
             }
-            self.noise = self.noise.learnt(&self.data, &left, &followed);
+            (self.noise, _) = self.noise.learnt(&self.data, &left, &followed);
             if gained + promised < SETTLED {
                 break;
             }
