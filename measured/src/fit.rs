@@ -165,7 +165,7 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     })
 }
 
-/// Memory of a fit [bytes], roughly: 322 MB for a ring of 400 gradients, readings and kicks whose fit took 461. Of all unknowns eight square matrices at a
+/// Memory of a fit [bytes], roughly: 303 MB for a ring of 400 gradients, readings and kicks whose fit took 402. Of all unknowns eight square matrices at a
 /// time, of each lane of a sum the machine's block, of two predictions some twenty matrices of the measured shape, and the factors of their derivatives.
 pub fn memory(unknowns: &[Unknown], (rows, columns): (usize, usize)) -> usize {
     let n = unknowns.len();

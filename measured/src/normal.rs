@@ -68,7 +68,7 @@ impl Places {
     pub fn back(&self, at: &Prediction, weighted: &DMatrix<f64>) -> DVector<f64> {
         let mut back = DVector::zeros(self.unknowns);
         back.rows_mut(0, self.machine).copy_from(&at.by_machine.by_column(weighted).row_sum_tr());
-        for (row, column) in places_of(weighted) {
+        for (row, column) in counted(weighted) {
             for (one, by) in self.instruments(at, row, column) {
                 back[one] += by * weighted[(row, column)];
             }
@@ -82,7 +82,7 @@ impl Places {
         let mut back = DMatrix::zeros(self.unknowns, rows + columns);
         back.view_mut((0, 0), (self.machine, rows)).tr_copy_from(&at.by_machine.by_row(weighted));
         back.view_mut((0, rows), (self.machine, columns)).tr_copy_from(&at.by_machine.by_column(weighted));
-        for (row, column) in places_of(weighted) {
+        for (row, column) in counted(weighted) {
             for (one, by) in self.instruments(at, row, column) {
                 back[(one, row)] += by * weighted[(row, column)];
                 back[(one, rows + column)] += by * weighted[(row, column)];
@@ -95,17 +95,16 @@ impl Places {
     pub fn information(&self, at: &Prediction, weight: &DMatrix<f64>) -> DMatrix<f64> {
         let (rows, columns) = weight.shape();
         let mut information = DMatrix::zeros(self.unknowns, self.unknowns);
-        for lane in
-            in_lanes(&every(columns), weight.len() * self.machine.pow(2), |columns| self.square(at, weight, columns))
-        {
-            information.view_mut((0, 0), (self.machine, self.machine)).add_assign(&lane);
-        }
-        let with_machine = in_lanes(&[0, 1], weight.len() * self.machine, |which| {
-            let which = which[0];
+        let work = weight.len() * self.machine.pow(2);
+        let squares = in_lanes(&every(columns), work, |columns| self.square(at, weight, columns));
+        squares.iter().for_each(|square| information.view_mut((0, 0), square.shape()).add_assign(square));
+        // gains and couplings meet the machine
+        let instruments = in_lanes(&[0, 1], weight.len() * self.machine, |lane| {
+            let which = lane[0];
             let by_row = at.by_machine.by_row(&weight.component_mul(&at.by_monitor[which]));
             (which, by_row, at.by_machine.by_column(&weight.component_mul(&at.by_corrector[which])))
         });
-        for (which, by_row, by_column) in with_machine {
+        for (which, by_row, by_column) in instruments {
             let of_rows = (0..rows).map(|row| (self.rows[row][which], by_row.row(row)));
             let of_columns = (0..columns).map(|column| (self.columns[column][which], by_column.row(column)));
             for (place, said) in of_rows.chain(of_columns) {
@@ -114,7 +113,7 @@ impl Places {
         }
         information.fill_upper_triangle_with_lower_triangle();
         let mut each = Vec::new();
-        for (row, column) in places_of(weight) {
+        for (row, column) in counted(weight) {
             each.clear();
             each.extend(self.instruments(at, row, column));
             for &(one, by) in &each {
@@ -132,13 +131,12 @@ impl Places {
             let roots =
                 columns.iter().flat_map(|&column| weight.column(column).into_iter().map(|weight| weight.sqrt()));
             let roots = DVector::from_iterator(columns.len() * rows, roots);
-            let by_machine = at.by_machine.weighted(columns, &roots);
-            let counted: Vec<usize> = (0..roots.len()).filter(|&element| roots[element] > 0.0).collect();
-            if counted.len() < roots.len() / 2 {
-                add_square(&by_machine.select_rows(&counted), &mut square);
-            } else {
-                add_square(&by_machine, &mut square);
+            let mut by_machine = at.by_machine.weighted(columns, &roots);
+            let kept: Vec<usize> = (0..roots.len()).filter(|&element| roots[element] > 0.0).collect();
+            if kept.len() < roots.len() / 2 {
+                by_machine = by_machine.select_rows(&kept);
             }
+            add_square(&by_machine, &mut square);
         }
         square
     }
@@ -209,7 +207,7 @@ fn row_products(one: &DMatrix<f64>, other: &DMatrix<f64>) -> DVector<f64> {
 }
 
 /// Places of the elements that count.
-fn places_of(weights: &DMatrix<f64>) -> impl Iterator<Item = (usize, usize)> + '_ {
+fn counted(weights: &DMatrix<f64>) -> impl Iterator<Item = (usize, usize)> + '_ {
     let all = (0..weights.ncols()).flat_map(|column| (0..weights.nrows()).map(move |row| (row, column)));
     all.filter(|&place| weights[place] != 0.0)
 }
