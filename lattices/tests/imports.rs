@@ -628,6 +628,12 @@ fn blocks_are_put_together_by_their_names() {
     assert_eq!(said, "t: y:BPM[1] to y:COR[1] stands in t too");
     let said = x.joined(table("1 2\n")).unwrap_err().to_string();
     assert_eq!(said, "t: lines or columns have no names, by which several tables are put together");
+    // a line of as many columns as fit into a megabyte, and a column of as many lines
+    let names = |plane: &str| (1..=60_000).map(move |number| format!("{plane}{number}")).collect::<Vec<_>>();
+    let wide = table(&format!(",{}\nx:BPM[1]{}\n", names("c").join(","), ",1".repeat(60_000)));
+    let long = table(&format!(",y:COR[1]\n{},1\n", names("r").join(",1\n")));
+    let said = wide.joined(long).unwrap_err().to_string();
+    assert!(said.contains("t: beside t: expected at most 201326592 bytes in memory"), "{said}");
 }
 
 #[test]
@@ -672,7 +678,8 @@ fn sdds(mode: &str, data: &[u8]) -> Vec<u8> {
         "SDDS2\n!# little-endian\n&description text=\"ring\", contents=\"horizontal-plane \\\"response\\\" matrix\", &end\n\
          &parameter name=NMonitors, type=long, fixed_value=2, &end\n&parameter name=Stage, type=string, &end\n\
          &column name=BPMName, type=string, description=\"a, b=c\", &end\n&column name=s, units=m, type=double, &end\n\
-         &column name=COR#1, units=m/rad,\n type=double, &end\n&column name=COR#2.HKICK, units=m/rad, type=float, &end\n\
+         &column name=COR#1, units=m/rad,\n type=double, &end\n\n&column name=COR#2.HKICK, units=m/rad, type=float, &end\n\
+         &column name=Flag, type=character, &end\n\
          &data mode={mode}, &end\n"
     );
     [header.as_bytes(), data].concat()
@@ -680,10 +687,10 @@ fn sdds(mode: &str, data: &[u8]) -> Vec<u8> {
 
 #[test]
 fn a_response_in_sdds_is_read_in_ascii_and_binary() {
-    let ascii = sdds("ascii", b"! page number 1\ntune corrected\n2\nBPM#1 0.5 1.5 -2\n\"BPM#2\" 1.25 0.25 4e0\n");
+    let ascii = sdds("ascii", b"! page number 1\ntune corrected\n2\nBPM#1 0.5 1.5 -2 k\n\"BPM#2\" 1.25 0.25 4e0 k\n");
     let text = |text: &str| [&(text.len() as i32).to_le_bytes()[..], text.as_bytes()].concat();
     let row = |name: &str, numbers: [f64; 2], last: f32| {
-        [text(name), numbers.map(f64::to_le_bytes).concat(), last.to_le_bytes().to_vec()].concat()
+        [text(name), numbers.map(f64::to_le_bytes).concat(), last.to_le_bytes().to_vec(), b"k".to_vec()].concat()
     };
     let page = [
         2i32.to_le_bytes().to_vec(),
@@ -714,7 +721,7 @@ fn a_response_in_sdds_is_read_in_ascii_and_binary() {
     };
     assert!(said(&[&ascii[..], b"again\n0\n"].concat()).ends_with("more than one page, expected one response"));
     assert!(said(&binary[..binary.len() - 2]).ends_with("cut off within its data"));
-    assert!(said(&sdds("ascii", b"none\n1\nBPM#1 0.5 x 2\n")).ends_with("expected a number, found x"));
+    assert!(said(&sdds("ascii", b"none\n1\nBPM#1 0.5 x 2 k\n")).ends_with("expected a number, found x"));
     let units = String::from_utf8(ascii.clone()).unwrap().replacen("m/rad", "m/A", 1);
     assert!(said(units.as_bytes()).ends_with("columns have the units m/a and m/rad, expected one"));
     for length in 4..binary.len() {

@@ -15,6 +15,7 @@ use super::hdf5::Matrix;
 use super::instruments::Order;
 use super::mat::{Mat, Place};
 use measured::MeasuredError;
+use twin::limits::MEMORY;
 
 /// Fields by which it is known.
 const FIELDS: [&str; 3] = ["Data", "Monitor", "Actuator"];
@@ -40,6 +41,8 @@ pub(super) fn read(all: &Place) -> Result<(Matrix, Stated), MeasuredError> {
         (rows[row], columns[column]) = (lines.max(rows[row]), width.max(columns[column]));
     }
     let mut matrix = Matrix { width: columns.iter().sum(), values: Vec::new() };
+    let bytes = (8 * matrix.width).saturating_mul(rows.iter().sum());
+    MEMORY.check(bytes as u64).map_err(|exceeded| all.wrong(&exceeded.to_string()))?;
     for (row, &lines) in rows.iter().enumerate() {
         let blocks = columns.iter().enumerate().map(|(column, &width)| match block(row, column) {
             None => Ok(vec![f64::NAN; lines * width]),

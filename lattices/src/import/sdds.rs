@@ -53,6 +53,12 @@ enum Kind {
     String,
 }
 
+impl Kind {
+    fn is_number(self) -> bool {
+        !matches!(self, Self::Character | Self::String)
+    }
+}
+
 impl FromStr for Kind {
     type Err = String;
 
@@ -144,7 +150,7 @@ impl Page {
     fn table(self, asked: Option<&str>) -> Found<(Stated, Option<Vec<String>>, Vec<(Option<String>, Vec<f64>)>)> {
         let names = self.columns.iter().position(|one| one.kind == Kind::String);
         let place = |name: &str| {
-            let found = self.columns.iter().position(|one| one.name == name && one.kind != Kind::String);
+            let found = self.columns.iter().position(|one| one.name == name && one.kind.is_number());
             let have = || self.columns.iter().map(|one| one.name.as_str()).collect::<Vec<_>>().join(", ");
             found.ok_or_else(|| format!("no column of numbers {name}; found {}", have()))
         };
@@ -171,7 +177,7 @@ impl Page {
             return Ok((self.stated(&chosen)?, None, chosen.iter().flat_map(of_column).collect()));
         }
         let matrix: Vec<usize> = (0..self.columns.len())
-            .filter(|&at| self.columns[at].kind != Kind::String && self.columns[at].name != POSITION)
+            .filter(|&at| self.columns[at].kind.is_number() && self.columns[at].name != POSITION)
             .collect();
         let head = matrix.iter().map(|&at| corrector(&self.columns[at].name, plane)).collect();
         let lines = self.rows.iter().map(|row| (line(row, plane), matrix.iter().map(|&at| number(row, at)).collect()));
@@ -297,7 +303,8 @@ impl Header<'_> {
             match line.strip_prefix('!') {
                 Some(comment) if comment.contains("big-endian") => self.is_little = false,
                 Some(_) => {}
-                None => text = format!("{text} {line}").trim().to_owned(),
+                None if line.is_empty() => {}
+                None => text.extend([" ", line.as_str()]),
             }
             TEXT.check(text.len() as u64).map_err(|exceeded| exceeded.to_string())?;
         }

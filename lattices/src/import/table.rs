@@ -2,6 +2,7 @@
 //! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
 //! A response matrix of the Matlab Middle Layer needs no `NAME`. Matrices of pyAML and of SDDS have names, and say their units.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use super::conventions::Stated;
@@ -101,19 +102,25 @@ impl Table {
             return bare.refuse("lines or columns have no names, by which several tables are put together".into());
         }
         let mut whole = self;
-        let place = |names: &mut Vec<String>, name: String| {
-            let found = names.iter().position(|own| *own == name);
-            found.unwrap_or_else(|| {
-                names.push(name);
-                names.len() - 1
+        let mut head = whole.columns.take().unwrap_or_default();
+        let bytes = (8 * (head.len() + other.columns.iter().flatten().count()))
+            .saturating_mul(whole.rows.len() + other.rows.len());
+        if let Err(exceeded) = MEMORY.check(bytes as u64) {
+            return other.refuse(format!("beside {}: {exceeded}", whole.file));
+        }
+        let mut place: HashMap<String, usize> = head.iter().cloned().zip(0..).collect();
+        let mut column = |name: &String| {
+            *place.entry(name.clone()).or_insert_with(|| {
+                head.push(name.clone());
+                head.len() - 1
             })
         };
-        let mut head = whole.columns.take().unwrap_or_default();
-        let columns = other.columns.clone().unwrap_or_default();
-        let columns: Vec<usize> = columns.into_iter().map(|name| place(&mut head, name)).collect();
+        let columns: Vec<usize> = other.columns.iter().flatten().map(&mut column).collect();
         whole.rows.iter_mut().for_each(|row| row.values.resize(head.len(), f64::NAN));
+        let mut lines: HashMap<Option<String>, usize> =
+            whole.rows.iter().map(|row| row.name.clone()).zip(0..).collect();
         for Line { number, name, values } in &other.rows {
-            let at = whole.rows.iter().position(|row| row.name == *name).unwrap_or_else(|| {
+            let at = *lines.entry(name.clone()).or_insert_with(|| {
                 whole.rows.push(Line { number: *number, name: name.clone(), values: vec![f64::NAN; head.len()] });
                 whole.rows.len() - 1
             });

@@ -305,6 +305,25 @@ fn a_lattice_may_be_a_struct_array_and_noise_one_number() {
     assert!(loco.folder.monitors.iter().all(|one| one.sigma == 0.003));
 }
 
+/// Parameters of one struct each stand in a cell array, or are a struct array.
+#[test]
+fn parameters_of_a_struct_array_are_each_its_own() {
+    let [mut cells, mut array] = [file(), file()];
+    let Mat::Cells(shape, groups) = field(&mut cells, "FitParameters", 0, "Params").clone() else { panic!("cells") };
+    let first = |group: &Mat| match group {
+        Mat::Structs(_, names, values) => (names.clone(), values[0].clone()),
+        _ => panic!("a struct"),
+    };
+    let (names, values): (Vec<_>, Vec<_>) = groups.iter().map(first).unzip();
+    let alone = values.iter().map(|one| Mat::Structs(vec![1, 1], names[0].clone(), vec![one.clone()]));
+    *field(&mut cells, "FitParameters", 0, "Params") = Mat::Cells(shape.clone(), alone.collect());
+    *field(&mut array, "FitParameters", 0, "Params") = Mat::Structs(shape, names[0].clone(), values);
+    let [cells, array] = [cells, array].map(|file| read(&file).unwrap());
+    let parameters = [&cells, &array].map(|one| json!(one.folder.meta.reference_fit.as_ref().unwrap()));
+    assert_eq!(parameters[0], parameters[1]);
+    assert_eq!(cells.lattice.elements, array.lattice.elements);
+}
+
 /// `{1,2}` of a line and `{2,1}` of a column are the gradient; a trim of an insertion device that is tracked as a drift is nothing.
 #[test]
 fn fields_of_parameters_are_found_in_any_form() {

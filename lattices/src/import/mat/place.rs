@@ -68,6 +68,9 @@ impl<'a> Place<'a> {
 
     /// Structs of a cell array, of a struct array, or of cell arrays within each other.
     pub fn structs(&self) -> Result<Vec<Self>, MeasuredError> {
+        if self.is_struct() {
+            return Ok(vec![self.clone()]);
+        }
         let all = self.elements()?.into_iter();
         let each = all.map(|one| if one.is_struct() { Ok(vec![one]) } else { one.structs() });
         Ok(each.collect::<Result<Vec<_>, _>>()?.concat())
