@@ -5,6 +5,7 @@
 //!
 //! `K1 = G(I)/(B rho L) (1 - ramp Bdot/B)`,      `K2 = S(I)/(B rho L)`,      `kick = corrector I/(B rho)`.
 
+use core::fmt;
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
@@ -28,6 +29,13 @@ impl Polynomial {
 /// Weights of read-backs by name, whose sum is a current.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Weights(pub BTreeMap<String, f64>);
+
+impl fmt::Display for Weights {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let each: Vec<String> = self.0.iter().map(|(name, weight)| format!("{weight} {name}")).collect();
+        f.write_str(&each.join(" + "))
+    }
+}
 
 impl Weights {
     /// The current of some read-backs [A]; the first that is missing, if one is.
@@ -108,6 +116,8 @@ pub struct Currents {
     corrector: f64,
 }
 
+/// Read-back of the dipoles.
+const DIPOLE: &str = "dipole";
 /// Momentum of a unit charge over the rigidity, the speed of light in these units [GeV/c per T m].
 const MOMENTUM: f64 = 0.299_792_458;
 
@@ -175,6 +185,23 @@ impl Currents {
         if let Some(name) = missing {
             return Some(("every read-back of a current in design_A", format!("no {name}")));
         }
+        // a recording has a column of the dipoles, and one of each read-back of a supply
+        if self.dipole.current.0 != BTreeMap::from([(DIPOLE.to_owned(), 1.0)]) {
+            return Some(("the read-back dipole alone as the current of the dipoles", self.dipole.current.to_string()));
+        }
+        for (supply, law) in &self.quadrupoles {
+            let Weights(weights) = &law.current;
+            if weights.contains_key(supply) && (weights.len() > 1 || weights[supply] != 1.0) {
+                return Some(("a supply that is no read-back of its own sum", format!("{supply}: {}", law.current)));
+            }
+            let current = self.supply(supply).unwrap_or_default();
+            if !(current.is_finite() && current > 0.0) {
+                return Some(("a current of each supply above 0 at design_A", format!("{current} A of {supply}")));
+            }
+        }
+        if !(self.corrector.is_finite() && self.corrector > 0.0) {
+            return Some(("corrector_T_m_per_A above 0", self.corrector.to_string()));
+        }
         let rigidity = self.rigidity();
         (!(rigidity.is_finite() && rigidity > 0.0))
             .then(|| ("a field of the dipoles above 0 at design_A", format!("{rigidity} T m")))
@@ -221,5 +248,25 @@ mod tests {
         let mut law = law("");
         law.design.remove("trim");
         assert_eq!(law.lack(), Some(("every read-back of a current in design_A", "no trim".into())));
+    }
+
+    #[test]
+    fn a_law_that_recordings_cannot_follow_is_refused() {
+        let found = |change: &dyn Fn(&mut Currents)| {
+            let mut law = law("");
+            change(&mut law);
+            law.lack().unwrap().1
+        };
+        let sum = |names: [(&str, f64); 2]| Weights(names.map(|(name, weight)| (name.to_owned(), weight)).into());
+        let of_supply = |names| {
+            found(&|law: &mut Currents| {
+                law.design.insert("Q".into(), 10.0);
+                law.quadrupoles.get_mut("Q").unwrap().current = sum(names);
+            })
+        };
+        assert_eq!(of_supply([("Q", 1.0), ("trim", 0.2)]), "Q: 1 Q + 0.2 trim");
+        assert_eq!(of_supply([("dipole", 1.0), ("trim", 3.0)]), "-500 A of Q");
+        assert_eq!(found(&|law| law.dipole.current = sum([("dipole", 1.0), ("trim", 0.1)])), "1 dipole + 0.1 trim");
+        assert_eq!(found(&|law| law.corrector = -1e-4), "-0.0001");
     }
 }
