@@ -1,12 +1,14 @@
 //! Time and memory of fit, diagnosis and comparison against the size of a ring: a ring of cells with errors, measured with noise.
 //!
-//! `cargo bench -p measured --bench scale -- 50 100 200` prints a line a size, each in a process of its own, and the exponents of the gradients that
-//! times and memory grow with. The table of docs/large-rings.md.
+//! `cargo bench -p measured --bench scale -- 50 100 400x470x413x7700` prints a line a size, each in a process of its own, and the exponents of the gradients that
+//! times and memory grow with. A size is a number of gradients, with as many readings and kicks, or all three and how many rows the lattice has. The table of
+//! docs/large-rings.md.
 
 use core::error::Error;
 use core::f64::consts::TAU;
 use std::fs;
 use std::process::Command;
+use std::str::FromStr;
 use std::time::Instant;
 
 use measured::folder::{CorrectorRow, Folder, Meta, MonitorRow, Particle, Row};
@@ -28,18 +30,16 @@ const NAMES: [&str; 8] =
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|one| one != "--bench").collect();
-    if let [one, gradients] = arguments.as_slice()
+    if let [one, size] = arguments.as_slice()
         && one == "one"
     {
-        println!("{}", measure(gradients.parse()?)?.map(|number| number.to_string()).join(" "));
+        println!("{}", measure(size.parse()?)?.map(|number| number.to_string()).join(" "));
         return Ok(());
     }
     println!("{}", NAMES.map(|name| format!("{name:>11}")).concat());
     let mut lines = Vec::new();
-    for gradients in
-        if arguments.is_empty() { ["50", "100", "200", "400"].map(String::from).to_vec() } else { arguments }
-    {
-        let output = Command::new(std::env::current_exe()?).args(["one", &gradients]).output()?;
+    for size in if arguments.is_empty() { ["50", "100", "200", "400"].map(String::from).to_vec() } else { arguments } {
+        let output = Command::new(std::env::current_exe()?).args(["one", &size]).output()?;
         let numbers = String::from_utf8(output.stdout)?;
         let numbers: Vec<f64> = numbers.split_whitespace().map(str::parse).collect::<Result<_, _>>()?;
         println!("{}", numbers.iter().map(|number| format!("{number:>11.3}")).collect::<String>());
@@ -59,9 +59,30 @@ fn exponent(lines: &[Vec<f64>], column: usize) -> f64 {
     across / points.iter().map(|point| (point[0] - x).powi(2)).sum::<f64>()
 }
 
+/// Size of a ring and of its matrix.
+#[derive(Clone, Copy)]
+struct Size {
+    gradients: usize,
+    readings: usize,
+    kicks: usize,
+    rows: usize,
+}
+
+impl FromStr for Size {
+    type Err = Box<dyn Error>;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text.split('x').map(str::parse).collect::<Result<Vec<usize>, _>>()?[..] {
+            [all] => Ok(Self { gradients: all, readings: all, kicks: all, rows: 0 }),
+            [gradients, readings, kicks, rows] => Ok(Self { gradients, readings, kicks, rows }),
+            _ => Err(format!("{text}: expected GRADIENTS or GRADIENTSxREADINGSxKICKSxROWS").into()),
+        }
+    }
+}
+
 /// The numbers of one size.
-fn measure(gradients: usize) -> Result<[f64; 8], Box<dyn Error>> {
-    let ring = ring(gradients / 2);
+fn measure(size: Size) -> Result<[f64; 8], Box<dyn Error>> {
+    let (ring, gradients) = (ring(size), size.gradients);
     let (before, truth) = measured_with_errors(&ring, 2)?;
     let settings = Settings::default();
     let groups = groups(&before);
@@ -104,8 +125,10 @@ fn peak() -> Result<f64, Box<dyn Error>> {
     Ok(line.trim().trim_end_matches(" kB").parse::<f64>()? / 1024.0)
 }
 
-/// Cells of two quadrupoles, a dipole, a monitor and a corrector, both of both planes.
-fn ring(cells: usize) -> Folder {
+/// Cells of two quadrupoles and a dipole, among which monitors and correctors are spread, each of both planes but for an odd one; drifts are cut until there are so
+/// many rows.
+fn ring(size: Size) -> Folder {
+    let cells = size.gradients / 2;
     let (mut lattice, mut s) = (Vec::new(), 0.0);
     let mut add = |name: &str, length: f64, bend: f64, k1: f64| {
         let edge = bend / 2.0;
@@ -124,17 +147,35 @@ fn ring(cells: usize) -> Folder {
         lattice.len() - 1
     };
     let (mut monitors, mut correctors) = (Vec::new(), Vec::new());
+    // a cell has at least six rows, two of which are drifts
+    let pieces = (size.rows / cells).saturating_sub(6).div_ceil(2) + 1;
+    let spread = |count: usize, cell: usize| (cell + 1) * count / cells - cell * count / cells;
     for cell in 0..cells {
-        let at = add("BPM", 0.0, 0.0, 0.0);
-        monitors.extend([Plane::X, Plane::Y].map(|plane| MonitorRow { plane, at, sigma: NOISE, is_used: true }));
-        add("L", 0.4, 0.0, 0.0);
+        let mut drift = |add: &mut dyn FnMut(&str, f64, f64, f64) -> usize, length: f64, monitors_here: bool| {
+            let count = spread(size.readings / 2, cell);
+            for _ in 0..if monitors_here { count.min(1) } else { count.saturating_sub(1) } {
+                let at = add("BPM", 0.0, 0.0, 0.0);
+                monitors.extend([Plane::X, Plane::Y].map(|plane| MonitorRow {
+                    plane,
+                    at,
+                    sigma: NOISE,
+                    is_used: true,
+                }));
+            }
+            (0..pieces).for_each(|_| _ = add("L", length / pieces as f64, 0.0, 0.0));
+        };
+        drift(&mut add, 0.4, true);
         add("QF", 0.3, 0.0, 4.0);
-        let at = add("COR", 0.2, 0.0, 0.0);
-        correctors.extend([Plane::X, Plane::Y].map(|plane| CorrectorRow { plane, at, kick: 0.2, is_used: true }));
+        let kicks = [size.kicks.div_ceil(2), size.kicks / 2].map(|count| spread(count, cell));
+        for which in 0..kicks[0].max(kicks[1]).max(1) {
+            let at = add("COR", 0.2 / kicks[0].max(kicks[1]).max(1) as f64, 0.0, 0.0);
+            let planes = [Plane::X, Plane::Y].into_iter().zip(kicks).filter(|(_, count)| *count > which);
+            correctors.extend(planes.map(|(plane, _)| CorrectorRow { plane, at, kick: 0.2, is_used: true }));
+        }
         add("B", 1.2, TAU / cells as f64, 0.0);
         add("QD", 0.3, 0.0, -3.0);
         // no symmetry: cells that are all alike have modes that errors of gradients excite together
-        add("L", 0.6 + 0.2 * f64::from(u8::from(cell % 3 != 0)), 0.0, 0.0);
+        drift(&mut add, 0.6 + 0.2 * f64::from(u8::from(cell % 3 != 0)), false);
     }
     monitors.sort_by_key(|one| one.plane.index());
     correctors.sort_by_key(|one| one.plane.index());
@@ -148,7 +189,7 @@ fn ring(cells: usize) -> Folder {
     };
     let matrix = DMatrix::zeros(monitors.len(), correctors.len());
     let dispersion = Some(DVector::zeros(monitors.len()));
-    Folder { name: format!("{} cells", cells), meta, lattice, monitors, correctors, matrix, dispersion }
+    Folder { name: format!("{cells} cells"), meta, lattice, monitors, correctors, matrix, dispersion }
 }
 
 /// The ring measured with some noise, always with the same errors: strengths off by 0.3 %, gains by 2 % and couplings by 0.5 %, and the values of its unknowns.

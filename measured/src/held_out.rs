@@ -63,27 +63,20 @@ impl HeldOut {
         let residual = data.residual(prediction);
         let weight = data.weight(noise, &residual);
         let (rows, columns) = residual.shape();
-        let (mut left, mut steps, mut parts) = (residual.clone(), Vec::new(), Vec::new());
+        let whole = places.information(prediction, &weight);
+        let slope = places.back(prediction, &weight.component_mul(&residual));
+        let (mut left, mut steps) = (residual.clone(), Vec::new());
         for part in 0..PARTS * PARTS {
             let is_in = |row: usize, column: usize| row % PARTS == part / PARTS && column % PARTS == part % PARTS;
-            let weight =
+            let own =
                 DMatrix::from_fn(rows, columns, |row, column| f64::from(is_in(row, column)) * weight[(row, column)]);
-            let information = places.information(prediction, &weight);
-            parts.push((information, places.back(prediction, &weight.component_mul(&residual)), weight));
-        }
-        let whole = parts.iter().fold(DMatrix::zeros(width.len(), width.len()), |sum, part| sum + &part.0);
-        let slope = parts.iter().fold(DVector::zeros(width.len()), |sum, part| sum + &part.1);
-        for (information, own, weight) in &parts {
-            let matrix = times(&whole - information, width) + *precision;
-            let slope = (&slope - own).component_mul(width) - *pull;
-            let step = Factor::of(&matrix).ok_or(MeasuredError::Singular(0))?.solve(&slope).component_mul(width);
+            let matrix = times(&whole - places.information(prediction, &own), width) + *precision;
+            let without = &slope - places.back(prediction, &own.component_mul(&residual));
+            let downhill = without.component_mul(width) - *pull;
+            let step = Factor::of(&matrix).ok_or(MeasuredError::Singular(0))?.solve(&downhill).component_mul(width);
             let moved = places.forward(prediction, &step);
+            left.zip_zip_apply(&moved, &own, |left, moved, own| *left -= if own > 0.0 { moved } else { 0.0 });
             steps.push(step);
-            left.iter_mut()
-                .zip(&moved)
-                .zip(weight)
-                .filter(|(_, weight)| **weight > 0.0)
-                .for_each(|((left, moved), _)| *left -= moved);
         }
         left.zip_apply(&counted.sigma, |left, sigma| *left *= f64::from(sigma.is_finite()));
         let density = |column: usize| {
