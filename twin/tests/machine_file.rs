@@ -98,6 +98,9 @@ fn the_currents_of_the_page_make_the_strengths_that_are_left_out() {
     assert!(energy.starts_with("reference: expected the momentum of currents [GeV/c], found 2.78"), "{energy}");
     let missing = refused(serde_json::json!({"currents": {"design_A": {"trim": null}}}));
     assert_eq!(missing, "currents: expected every read-back of a current in design_A, found no trim");
+    let unused = serde_json::json!({"SX": {"current": {"dipole": 1}, "integrated": [0, 1e-3]}});
+    let unused = refused(serde_json::json!({"currents": {"sextupoles": unused}}));
+    assert_eq!(unused, "currents: expected a magnet for each name in them, found SX");
 }
 
 /// JSON merge patch (RFC 7386).

@@ -5,7 +5,7 @@
 //!
 //! `K1 = G(I)/(B rho L) (1 - ramp Bdot/B)`,      `K2 = S(I)/(B rho L)`,      `kick = corrector I/(B rho)`.
 
-use core::fmt;
+use core::{fmt, iter};
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
@@ -176,6 +176,12 @@ impl Currents {
         let at = |law: &Option<Polynomial>| law.as_ref().map(|law| law.at(current) / radius);
         let ramp = self.dipole.k2_ramp * self.ramp_rate / radius;
         [at(&self.dipole.k1), at(&self.dipole.k2).map(|k2| k2 + ramp)]
+    }
+
+    /// Supplies and families, and magnets whose eddy currents are their own.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        let laws = self.quadrupoles.iter().chain(&self.sextupoles);
+        laws.flat_map(|(name, law)| iter::once(name).chain(law.ramp_of.keys())).map(String::as_str)
     }
 
     /// What the law lacks, and what would be there: a read-back of a current, or a field of the dipoles.

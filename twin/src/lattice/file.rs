@@ -1,6 +1,6 @@
 //! The machine file: its JSON, checked and turned into a ring.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde::Deserialize;
@@ -176,13 +176,16 @@ impl MachineFile {
         }
         same("reference", "the momentum of currents [GeV/c]", Some(particle.momentum()), currents.momentum())?;
         let [body_k1, body_k2] = currents.body();
+        let mut unused: BTreeSet<&str> = currents.names().collect();
         for entry in &mut self.elements {
+            unused.remove(entry.name.as_str());
             let (name, length) = (entry.name.as_str(), entry.length);
             let family = entry.family.as_deref().unwrap_or_default();
             let stated = entry.k1.or_else(|| self.k1.get(family).copied().filter(|_| entry.kind == "quadrupole"));
             match entry.kind.as_str() {
                 "quadrupole" => {
                     let supply = self.families.get(family).map_or(Some(family), |of| of.supply(family));
+                    supply.iter().for_each(|supply| _ = unused.remove(supply));
                     let k1 = supply.and_then(|supply| currents.k1(supply, name, length));
                     k1.map_or(Ok(()), |k1| same(name, "the k1 of currents", stated, k1))?;
                     entry.k1 = k1.or(entry.k1);
@@ -193,6 +196,7 @@ impl MachineFile {
                     (entry.k1, entry.k2) = (body_k1.or(entry.k1), body_k2.or(entry.k2));
                 }
                 "sextupole" => {
+                    unused.remove(family);
                     let k2 = currents.k2(family, name, length);
                     k2.map_or(Ok(()), |k2| same(name, "the k2 of currents", entry.k2, k2))?;
                     entry.k2 = k2.or(entry.k2);
@@ -200,7 +204,8 @@ impl MachineFile {
                 _ => {}
             }
         }
-        Ok(())
+        let unused = unused.first().map(|name| refused("currents", "a magnet for each name in them", (*name).into()));
+        unused.unwrap_or(Ok(()))
     }
 
     fn particle(&self) -> Result<Particle, LatticeError> {
