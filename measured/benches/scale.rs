@@ -6,9 +6,9 @@
 
 use core::error::Error;
 use core::f64::consts::TAU;
+use core::str::FromStr;
 use std::fs;
 use std::process::Command;
-use std::str::FromStr;
 use std::time::Instant;
 
 use measured::folder::{CorrectorRow, Folder, Meta, MonitorRow, Particle, Row};
