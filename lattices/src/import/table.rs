@@ -108,7 +108,8 @@ impl Table {
         if let Err(exceeded) = MEMORY.check(bytes as u64) {
             return other.refuse(format!("beside {}: {exceeded}", whole.file));
         }
-        let mut place: HashMap<String, usize> = head.iter().cloned().zip(0..).collect();
+        // of equal names the first counts
+        let mut place: HashMap<String, usize> = (0..head.len()).rev().map(|at| (head[at].clone(), at)).collect();
         let mut column = |name: &String| {
             *place.entry(name.clone()).or_insert_with(|| {
                 head.push(name.clone());
@@ -118,7 +119,7 @@ impl Table {
         let columns: Vec<usize> = other.columns.iter().flatten().map(&mut column).collect();
         whole.rows.iter_mut().for_each(|row| row.values.resize(head.len(), f64::NAN));
         let mut lines: HashMap<Option<String>, usize> =
-            whole.rows.iter().map(|row| row.name.clone()).zip(0..).collect();
+            (0..whole.rows.len()).rev().map(|at| (whole.rows[at].name.clone(), at)).collect();
         for Line { number, name, values } in &other.rows {
             let at = *lines.entry(name.clone()).or_insert_with(|| {
                 whole.rows.push(Line { number: *number, name: name.clone(), values: vec![f64::NAN; head.len()] });

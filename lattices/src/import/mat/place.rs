@@ -71,8 +71,7 @@ impl<'a> Place<'a> {
         if self.is_struct() {
             return Ok(vec![self.clone()]);
         }
-        let all = self.elements()?.into_iter();
-        let each = all.map(|one| if one.is_struct() { Ok(vec![one]) } else { one.structs() });
+        let each = self.elements()?.into_iter().map(|one| one.structs());
         Ok(each.collect::<Result<Vec<_>, _>>()?.concat())
     }
 
