@@ -6,6 +6,7 @@
 
 use core::error::Error;
 use core::f64::consts::TAU;
+use core::iter::repeat_n;
 use core::str::FromStr;
 use std::fs;
 use std::process::Command;
@@ -130,52 +131,47 @@ fn peak() -> Result<f64, Box<dyn Error>> {
 fn ring(size: Size) -> Folder {
     let cells = size.gradients / 2;
     let (mut lattice, mut s) = (Vec::new(), 0.0);
-    let mut add = |name: &str, length: f64, bend: f64, k1: f64| {
-        let edge = bend / 2.0;
-        lattice.push(Row {
-            name: name.into(),
-            s,
-            length,
-            bend,
-            edge_in: edge,
-            edge_out: edge,
-            fringe: 0.0,
-            k1,
-            half_k2: 0.0,
-        });
-        s += length;
-        lattice.len() - 1
-    };
     let (mut monitors, mut correctors) = (Vec::new(), Vec::new());
     // a cell has at least six rows, two of which are drifts
     let pieces = (size.rows / cells).saturating_sub(6).div_ceil(2) + 1;
-    let spread = |count: usize, cell: usize| (cell + 1) * count / cells - cell * count / cells;
     for cell in 0..cells {
-        let mut drift = |add: &mut dyn FnMut(&str, f64, f64, f64) -> usize, length: f64, monitors_here: bool| {
-            let count = spread(size.readings / 2, cell);
-            for _ in 0..if monitors_here { count.min(1) } else { count.saturating_sub(1) } {
-                let at = add("BPM", 0.0, 0.0, 0.0);
-                monitors.extend([Plane::X, Plane::Y].map(|plane| MonitorRow {
-                    plane,
-                    at,
-                    sigma: NOISE,
-                    is_used: true,
-                }));
+        let [monitors_here, horizontal, vertical] = [size.readings / 2, size.kicks.div_ceil(2), size.kicks / 2]
+            .map(|count| (cell + 1) * count / cells - cell * count / cells);
+        let (windings, mut wound) = (horizontal.max(vertical).max(1), 0);
+        let monitor = |count: usize| repeat_n(("BPM", 0.0, 0.0, 0.0), count);
+        let drift = |length: f64| repeat_n(("L", length / pieces as f64, 0.0, 0.0), pieces);
+        let rows = monitor(monitors_here.min(1))
+            .chain(drift(0.4))
+            .chain([("QF", 0.3, 0.0, 4.0)])
+            .chain(repeat_n(("COR", 0.2 / windings as f64, 0.0, 0.0), windings))
+            .chain([("B", 1.2, TAU / cells as f64, 0.0), ("QD", 0.3, 0.0, -3.0)])
+            .chain(monitor(monitors_here.saturating_sub(1)))
+            // no symmetry: cells that are all alike have modes that errors of gradients excite together
+            .chain(drift(0.6 + 0.2 * f64::from(u8::from(cell % 3 != 0))));
+        for (name, length, bend, k1) in rows {
+            let (at, planes, edge) = (lattice.len(), [Plane::X, Plane::Y], bend / 2.0);
+            match name {
+                "BPM" => monitors.extend(planes.map(|plane| MonitorRow { plane, at, sigma: NOISE, is_used: true })),
+                "COR" => {
+                    let planes = planes.into_iter().zip([horizontal, vertical]).filter(|(_, count)| *count > wound);
+                    correctors.extend(planes.map(|(plane, _)| CorrectorRow { plane, at, kick: 0.2, is_used: true }));
+                    wound += 1;
+                }
+                _ => {}
             }
-            (0..pieces).for_each(|_| _ = add("L", length / pieces as f64, 0.0, 0.0));
-        };
-        drift(&mut add, 0.4, true);
-        add("QF", 0.3, 0.0, 4.0);
-        let kicks = [size.kicks.div_ceil(2), size.kicks / 2].map(|count| spread(count, cell));
-        for which in 0..kicks[0].max(kicks[1]).max(1) {
-            let at = add("COR", 0.2 / kicks[0].max(kicks[1]).max(1) as f64, 0.0, 0.0);
-            let planes = [Plane::X, Plane::Y].into_iter().zip(kicks).filter(|(_, count)| *count > which);
-            correctors.extend(planes.map(|(plane, _)| CorrectorRow { plane, at, kick: 0.2, is_used: true }));
+            lattice.push(Row {
+                name: name.into(),
+                s,
+                length,
+                bend,
+                edge_in: edge,
+                edge_out: edge,
+                fringe: 0.0,
+                k1,
+                half_k2: 0.0,
+            });
+            s += length;
         }
-        add("B", 1.2, TAU / cells as f64, 0.0);
-        add("QD", 0.3, 0.0, -3.0);
-        // no symmetry: cells that are all alike have modes that errors of gradients excite together
-        drift(&mut add, 0.6 + 0.2 * f64::from(u8::from(cell % 3 != 0)), false);
     }
     monitors.sort_by_key(|one| one.plane.index());
     correctors.sort_by_key(|one| one.plane.index());
