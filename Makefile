@@ -103,7 +103,7 @@ bench: toolchain .venv ## medians of the hot paths, and pyAT on the same respons
 	cargo bench --locked -p system-tests
 	.venv/bin/python tests/peers/pyat_response.py
 
-scale: toolchain ## time and memory of fits of measured matrices against the size of the ring: the table of docs/large-rings.md; many minutes. SIZES="50 400x470x413x7700": gradients, readings, kicks, rows
+scale: toolchain ## time and memory of fits of measured matrices against the size of the ring: the table of docs/large-rings.md; many minutes. SIZES="60 400x470x413x7700": gradients, readings, kicks, rows
 	cargo bench --locked -p measured --bench scale -- $(SIZES)
 
 .venv:
