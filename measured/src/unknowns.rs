@@ -132,21 +132,19 @@ fn distinct(rows: &[usize]) -> Magnets {
     rows
 }
 
-/// Every magnet of some sort; neighbouring rows of one name, with nothing of length between them, are one magnet.
+/// Every magnet of some sort.
 pub fn magnets(folder: &Folder, is_magnet: impl Fn(&Row) -> bool) -> Vec<Magnets> {
-    let mut groups: Vec<Magnets> = Vec::new();
-    for (row, one) in folder.lattice.iter().enumerate().filter(|(_, one)| is_magnet(one)) {
-        let joins = |group: &Magnets| {
-            let &last = group.last().expect("groups are not empty");
-            folder.lattice[last].name == one.name
-                && folder.lattice[last + 1..row].iter().all(|between| between.length == 0.0)
-        };
-        match groups.last_mut() {
-            Some(group) if joins(group) => group.push(row),
-            _ => groups.push(vec![row]),
-        }
-    }
-    groups
+    let rows: Vec<usize> = (0..folder.lattice.len()).filter(|&row| is_magnet(&folder.lattice[row])).collect();
+    cut(folder, &rows).map(<[usize]>::to_vec).collect()
+}
+
+/// Rows of each magnet: neighbouring ones of one name, with nothing of length between them, are one magnet.
+fn cut<'r>(folder: &'r Folder, rows: &'r [usize]) -> impl Iterator<Item = &'r [usize]> + Clone {
+    let is_one = |one: &usize, next: &usize| {
+        folder.lattice[*one].name == folder.lattice[*next].name
+            && folder.lattice[one + 1..*next].iter().all(|between| between.length == 0.0)
+    };
+    rows.chunk_by(is_one)
 }
 
 /// Rows of every straight in which a wiggler may stand, a metre and more of field-free rows: those of the name that the middle has.
@@ -173,11 +171,14 @@ pub fn straights(folder: &Folder) -> Vec<Magnets> {
 
 /// What is fitted of a group of gradients: a factor, or a gradient that is added where the lattice has none, or less than a magnet without one may have.
 fn of_gradients(folder: &Folder, group: usize, rows: &Magnets, widths: &Widths) -> Unknown {
-    let magnets = rows.iter().map(|&row| &folder.lattice[row]);
-    if magnets.clone().any(|one| (one.k1 * one.length).abs() > widths.skew) {
+    let magnets = cut(folder, rows);
+    let integrated = |magnet: &[usize], field: fn(&Row) -> f64| {
+        magnet.iter().map(|&row| field(&folder.lattice[row]) * folder.lattice[row].length).sum::<f64>()
+    };
+    if magnets.clone().any(|magnet| integrated(magnet, |row| row.k1).abs() > widths.skew) {
         return Unknown { kind: Kind::Strength(group), mean: 1.0, width: widths.strength };
     }
-    let length = magnets.map(|one| one.length).sum::<f64>() / rows.len() as f64;
+    let length = integrated(rows, |_| 1.0) / magnets.count() as f64;
     Unknown { kind: Kind::Added(group), mean: 0.0, width: widths.skew / length }
 }
 
@@ -236,5 +237,31 @@ pub fn name(folder: &Folder, groups: &Groups, kind: Kind) -> String {
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => folder.monitor(row),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => folder.corrector(column),
         Kind::RfScale | Kind::HeldFrequency => "RF".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::ring;
+
+    #[test]
+    fn a_magnet_that_is_cut_into_many_rows_keeps_its_factor() {
+        let mut ring = ring();
+        ring.meta.reference_fit = None;
+        // of 1.2 /m, cut into rows of 0.004 /m with markers between them
+        let pieces = |row: &Row| {
+            let count = if row.name == "QF" { 300 } else { 1 };
+            let piece = Row { length: row.length / f64::from(count), ..row.clone() };
+            let marker = Row { name: "M".into(), length: 0.0, k1: 0.0, ..row.clone() };
+            (0..count).flat_map(move |_| [piece.clone(), marker.clone()])
+        };
+        ring.lattice = ring.lattice.iter().flat_map(pieces).collect();
+        let all = unknowns(&ring, &groups(&ring), false, &Widths::default());
+        let [strengths, added] = [
+            all.iter().filter(|one| matches!(one.kind, Kind::Strength(_))).count(),
+            all.iter().filter(|one| matches!(one.kind, Kind::Added(_))).count(),
+        ];
+        assert_eq!([strengths, added], [24, 0]);
     }
 }
