@@ -101,14 +101,15 @@ impl ByMachine {
         let orbits: Vec<&[usize]> =
             columns.iter().filter_map(|&column| self.pieces.get(column).map(Vec::as_slice)).collect();
         let mut made = DMatrix::zeros(weights.len(), self.count());
-        let [mut all, mut one] = [(); 2].map(|()| DVector::zeros(weights.len()));
+        let mut all = vec![0.0; weights.len()];
         for (number, shares) in self.shares.iter().enumerate() {
             all.fill(0.0);
-            for (counts, hold) in &self.holds {
-                hold.columns(&orbits, number, one.as_mut_slice());
-                all.cmpy(*counts, &one, weights, 1.0);
+            self.holds.iter().for_each(|(counts, hold)| hold.add_columns(&orbits, number, *counts, &mut all));
+            for &(unknown, share) in shares {
+                let made = made.column_mut(unknown).data.into_slice_mut();
+                let each = made.iter_mut().zip(&all).zip(weights.as_slice());
+                each.for_each(|((made, one), weight)| *made += share * one * weight);
             }
-            shares.iter().for_each(|&(unknown, share)| made.column_mut(unknown).axpy(share, &all, 1.0));
         }
         if let Some(by_share) = &self.by_share {
             let by_share = columns.iter().flat_map(|&column| by_share.column(column).into_iter().copied());
@@ -157,12 +158,13 @@ impl ByMachine {
 }
 
 impl OfHold {
-    /// The derivatives of some columns in turn by a number that changes: those of correctors' orbits, and the last one where there is room.
-    fn columns(&self, orbits: &[&[usize]], number: usize, into: &mut [f64]) {
-        self.factors.orbits(orbits, number, into);
+    /// Add so many times the derivatives of some columns in turn by a number that changes: those of correctors' orbits, and the last one where there is room.
+    fn add_columns(&self, orbits: &[&[usize]], number: usize, times: f64, into: &mut [f64]) {
+        self.factors.add_orbits(orbits, number, times, into);
         if let Some(dispersion) = &self.dispersion {
             let last = into.chunks_exact_mut(dispersion.nrows()).skip(orbits.len());
-            last.for_each(|last| last.copy_from_slice(dispersion.column(number).data.into_slice()));
+            let by = dispersion.column(number);
+            last.for_each(|last| last.iter_mut().zip(&by).for_each(|(last, by)| *last += times * by));
         }
     }
 

@@ -56,18 +56,18 @@ impl ResponseFactors {
         self.gradients.len()
     }
 
-    /// Derivatives of some orbits by a gradient, of all observers in turn for each orbit; an orbit may have several sources.
-    pub fn orbits(&self, orbits: &[&[usize]], gradient: usize, into: &mut [f64]) {
+    /// Add so many times the derivatives of some orbits by a gradient, of all observers in turn for each orbit; an orbit may have several sources.
+    pub fn add_orbits(&self, orbits: &[&[usize]], gradient: usize, times: f64, into: &mut [f64]) {
         let count = self.observers.len();
         let [a, b, c, d, e, f] = array::from_fn(|sixth| self.seen.column(6 * gradient + sixth).data.into_slice());
         for (orbit, sources) in into.chunks_exact_mut(count).zip(orbits) {
-            let sent: [f64; 6] = self.sent_by(sources, gradient).into();
+            let sent: [f64; 6] = (self.sent_by(sources, gradient) * times).into();
             let seen = a.iter().zip(b).zip(c).zip(d).zip(e).zip(f);
             for (orbit, (((((a, b), c), d), e), f)) in orbit.iter_mut().zip(seen) {
-                *orbit = a * sent[0] + b * sent[1] + c * sent[2] + d * sent[3] + e * sent[4] + f * sent[5];
+                *orbit += a * sent[0] + b * sent[1] + c * sent[2] + d * sent[3] + e * sent[4] + f * sent[5];
             }
             for within in sources.iter().filter_map(|&source| self.within(source, gradient)) {
-                orbit.iter_mut().zip(within).for_each(|(orbit, within)| *orbit -= within);
+                orbit.iter_mut().zip(within).for_each(|(orbit, within)| *orbit -= times * within);
             }
         }
     }
@@ -169,7 +169,7 @@ mod tests {
         for (gradient, matrix) in matrices.iter().enumerate() {
             for (source, exact) in matrix.column_iter().enumerate() {
                 let mut made = vec![0.0; observers.len()];
-                factors.orbits(&[&[source]], gradient, &mut made);
+                factors.add_orbits(&[&[source]], gradient, 1.0, &mut made);
                 let off = made.iter().zip(&exact).map(|(made, exact)| (made - exact).abs()).fold(0.0, f64::max);
                 assert!(off < 1e-12 * matrix.amax(), "{gradient} {source}: {off}");
             }
@@ -184,9 +184,9 @@ mod tests {
         let mut moved = factors.forward(&orbits, &step);
         for (gradient, matrix) in matrices.iter().enumerate() {
             let exact = matrix.columns_range(..orbits.len()) + matrix.columns_range(1..);
-            let mut made = DMatrix::zeros(observers.len(), orbits.len());
-            factors.orbits(&orbits, gradient, made.as_mut_slice());
-            assert!((made - &exact).amax() < 1e-12 * matrix.amax(), "{gradient}: rounding");
+            let mut made = exact.clone();
+            factors.add_orbits(&orbits, gradient, 2.0, made.as_mut_slice());
+            assert!((made - 3.0 * &exact).amax() < 1e-12 * matrix.amax(), "{gradient}: rounding");
             let weighted = weights.component_mul(&exact);
             let off = (by_orbit.column(gradient) - weighted.row_sum_tr()).amax();
             assert!(off < 1e-12 * matrix.norm(), "{gradient}: rounding");
