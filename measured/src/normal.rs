@@ -95,8 +95,10 @@ impl Places {
     pub fn information(&self, at: &Prediction, weight: &DMatrix<f64>) -> DMatrix<f64> {
         let (rows, columns) = weight.shape();
         let mut information = DMatrix::zeros(self.unknowns, self.unknowns);
-        let work = weight.len() * self.machine.pow(2);
-        let squares = in_lanes(&every(columns), work, |columns| self.square(at, weight, columns));
+        let told: Vec<usize> =
+            (0..columns).filter(|&column| weight.column(column).iter().any(|&one| one > 0.0)).collect();
+        let work = weight.nrows() * told.len() * self.machine.pow(2);
+        let squares = in_lanes(&told, work, |columns| self.square(at, weight, columns));
         squares.iter().for_each(|square| information.view_mut((0, 0), square.shape()).add_assign(square));
         // gains and couplings meet the machine
         let instruments = in_lanes(&[0, 1], weight.len() * self.machine, |lane| {
@@ -163,7 +165,8 @@ impl Places {
                 self.rows[row][which].map_or(0.0, |place| covariance[(place, unknown)])
             })
         });
-        let lanes = in_lanes(&every(at.matrix.ncols()), at.matrix.len() * self.machine.pow(2), |columns| {
+        let every: Vec<usize> = (0..at.matrix.ncols()).collect();
+        let lanes = in_lanes(&every, at.matrix.len() * self.machine.pow(2), |columns| {
             let each = columns.iter();
             each.map(|&column| self.variance_of_column(at, column, covariance, (&of_machine, &of_monitors)))
                 .collect::<Vec<_>>()
@@ -214,10 +217,6 @@ fn counted(weights: &DMatrix<f64>) -> impl Iterator<Item = (usize, usize)> + '_ 
 
 /// Elements whose derivatives are multiplied at once: fewer leave the processor waiting for memory.
 const DEEP: usize = 512;
-
-fn every(count: usize) -> Vec<usize> {
-    (0..count).collect()
-}
 
 /// An information matrix in units of the priors' widths, with the priors.
 pub fn in_widths(information: DMatrix<f64>, width: &DVector<f64>) -> DMatrix<f64> {
