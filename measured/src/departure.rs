@@ -16,6 +16,7 @@ use crate::descent::{EXACT, descend};
 use crate::error::MeasuredError;
 use crate::fit::{Learnt, with_model_error};
 use crate::model::Model;
+use crate::noise::Noise;
 use crate::released::{Held, Released};
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Kind, Unknown, Widths};
@@ -69,6 +70,7 @@ impl Departures {
             held.map(|(one, &mean)| Unknown { mean, width: beforehand(one.kind), ..*one }).collect();
         loop {
             let start = descend(model, &unknowns, &data.measured, &data.stated(), (expected.values.clone(), EXACT))?;
+            let start = (start, Noise::stated(data.measured.nrows()));
             let Learnt { here, noise, uncertainty } = with_model_error(model, &unknowns, data, start, progress)?;
             let held = Held::of((&unknowns, &here.values, &here.prediction), (data, &noise), &uncertainty.independent);
             let clear = clear(unknowns.len());

@@ -146,7 +146,8 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     let chi2_loco = data.chi2(&as_stated.prediction) / elements as f64;
     let stated_residual = data.residual(&as_stated.prediction);
     let steps = as_stated.steps;
-    let Learnt { here, noise, uncertainty } = with_model_error(&model, &unknowns, &data, as_stated, progress)?;
+    let start = (as_stated, Noise::stated(data.measured.nrows()));
+    let Learnt { here, noise, uncertainty } = with_model_error(&model, &unknowns, &data, start, progress)?;
     Ok(Fit {
         groups,
         chi2_loco,
@@ -174,7 +175,7 @@ pub fn memory(unknowns: &[Unknown], (rows, columns): (usize, usize)) -> usize {
     size_of::<f64>() * (8 * n * n + LANES * machine * machine + 20 * rows * columns + 12 * rows * machine)
 }
 
-/// Descend with what the model misses in each block, which is learnt in turn with the unknowns.
+/// Learn in turn what the model misses in each block and the unknowns, from where a descent with some errors of the elements ended.
 ///
 /// # Errors
 /// [`MeasuredError`].
@@ -182,10 +183,10 @@ pub fn with_model_error(
     model: &Model,
     unknowns: &[Unknown],
     data: &Data,
-    from: Descent,
+    (mut here, mut noise): (Descent, Noise),
     progress: &mut dyn FnMut(&str),
 ) -> Result<Learnt, MeasuredError> {
-    let (mut here, mut noise, mut steps) = (from, Noise::stated(data.measured.nrows()), 0);
+    let mut steps = 0;
     let places = Places::of(unknowns, data.measured.nrows(), data.measured.ncols());
     for round in 1..=ROUNDS {
         progress(&format!("error of the model, round {round} of {ROUNDS}"));

@@ -53,7 +53,8 @@ impl Share {
         let (model, data) = (Model::of(folder, &fitted.groups, settings.rf)?, &fitted.data);
         let weight = data.weight(&fitted.noise, &fitted.residual);
         let start = descend(&model, &unknowns, &data.measured, &weight, (DVector::from_vec(values), EXACT))?;
-        let Learnt { here, noise, uncertainty } = with_model_error(&model, &unknowns, data, start, progress)?;
+        let Learnt { here, noise, uncertainty } =
+            with_model_error(&model, &unknowns, data, (start, fitted.noise.clone()), progress)?;
         let (value, scatter) = (here.values[place], uncertainty.sigma[place]);
         let likelihoods = data.log_likelihood(&noise, &data.residual(&here.prediction))
             - data.log_likelihood(&fitted.noise, &fitted.residual);
