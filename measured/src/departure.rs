@@ -70,8 +70,9 @@ impl Departures {
             held.map(|(one, &mean)| Unknown { mean, width: beforehand(one.kind), ..*one }).collect();
         loop {
             let start = descend(model, &unknowns, &data.measured, &data.stated(), (expected.values.clone(), EXACT))?;
-            let start = (start, Noise::stated(data.measured.nrows()));
-            let Learnt { here, noise, uncertainty } = with_model_error(model, &unknowns, data, start, progress)?;
+            let stated = Noise::stated(data.measured.nrows());
+            let Learnt { here, noise, uncertainty } =
+                with_model_error(model, &unknowns, data, (start, stated), progress)?;
             let held = Held::of((&unknowns, &here.values, &here.prediction), (data, &noise), &uncertainty.independent);
             let clear = clear(unknowns.len());
             let of_expected = expected.covariance.as_ref().map(|errors| followed(&uncertainty, &unknowns, errors));

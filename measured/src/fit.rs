@@ -146,8 +146,9 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     let chi2_loco = data.chi2(&as_stated.prediction) / elements as f64;
     let stated_residual = data.residual(&as_stated.prediction);
     let steps = as_stated.steps;
-    let start = (as_stated, Noise::stated(data.measured.nrows()));
-    let Learnt { here, noise, uncertainty } = with_model_error(&model, &unknowns, &data, start, progress)?;
+    let stated = Noise::stated(data.measured.nrows());
+    let Learnt { here, noise, uncertainty } =
+        with_model_error(&model, &unknowns, &data, (as_stated, stated), progress)?;
     Ok(Fit {
         groups,
         chi2_loco,
