@@ -139,7 +139,7 @@ pub fn magnets(folder: &Folder, is_magnet: impl Fn(&Row) -> bool) -> Vec<Magnets
 }
 
 /// Rows of each magnet: neighbouring ones of one name, with nothing of length between them, are one magnet.
-fn cut<'r>(folder: &'r Folder, rows: &'r [usize]) -> impl Iterator<Item = &'r [usize]> + Clone {
+fn cut<'r>(folder: &'r Folder, rows: &'r [usize]) -> impl Iterator<Item = &'r [usize]> {
     let is_one = |one: &usize, next: &usize| {
         folder.lattice[*one].name == folder.lattice[*next].name
             && folder.lattice[one + 1..*next].iter().all(|between| between.length == 0.0)
@@ -171,14 +171,11 @@ pub fn straights(folder: &Folder) -> Vec<Magnets> {
 
 /// What is fitted of a group of gradients: a factor, or a gradient that is added where the lattice has none, or less than a magnet without one may have.
 fn of_gradients(folder: &Folder, group: usize, rows: &Magnets, widths: &Widths) -> Unknown {
-    let magnets = cut(folder, rows);
-    let integrated = |magnet: &[usize], field: fn(&Row) -> f64| {
-        magnet.iter().map(|&row| field(&folder.lattice[row]) * folder.lattice[row].length).sum::<f64>()
-    };
-    if magnets.clone().any(|magnet| integrated(magnet, |row| row.k1).abs() > widths.skew) {
+    let integrated = |&row: &usize| folder.lattice[row].k1 * folder.lattice[row].length;
+    if cut(folder, rows).any(|magnet| magnet.iter().map(integrated).sum::<f64>().abs() > widths.skew) {
         return Unknown { kind: Kind::Strength(group), mean: 1.0, width: widths.strength };
     }
-    let length = integrated(rows, |_| 1.0) / magnets.count() as f64;
+    let length = rows.iter().map(|&row| folder.lattice[row].length).sum::<f64>() / rows.len() as f64;
     Unknown { kind: Kind::Added(group), mean: 0.0, width: widths.skew / length }
 }
 
