@@ -10,7 +10,7 @@ ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench scale peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks schema supply-chain
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench scale rooms peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks schema supply-chain
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -100,11 +100,14 @@ figures: toolchain ## the figures of the worked case in docs/diagnosis.md, from 
 	cargo run --locked --release -p results --example figures -- recordings/concealed/open-10 docs/figures what-was-found place-scan evidence
 
 bench: toolchain .venv ## medians of the hot paths, and pyAT on the same response
-	cargo bench --locked -p system-tests
+	cargo bench --locked -p system-tests --bench core --bench twin
 	.venv/bin/python tests/peers/pyat_response.py
 
 scale: toolchain ## time and memory of fits of measured matrices against the size of the ring: the table of docs/large-rings.md; many minutes. SIZES="60 400x470x413x7700": gradients, readings, kicks, rows
 	cargo bench --locked -p measured --bench scale -- $(SIZES)
+
+rooms: toolchain ## time of a frame in each core, on simulated rings that nearly fill it, ten frames a second
+	cargo bench --locked -p system-tests --bench rooms
 
 .venv:
 	python3 -m venv .venv

@@ -14,7 +14,7 @@ mod tests;
 
 use estimator::{FitQuality, FrameError, Layout, MonitorState, Sizes};
 use serde::{Deserialize, Serialize};
-use training::rooms::large;
+use training::rooms::largest;
 
 use filter::Filter;
 use instrument::{Bounds, Instrument, Limits, Sample};
@@ -167,7 +167,7 @@ pub struct Measured {
 pub fn measured(sizes: &Sizes, frame: &[u8]) -> Result<Measured, FrameError> {
     let [monitors, correctors] = [sizes.monitors, sizes.correctors].map(|each| each.iter().sum::<u16>());
     let ring = Sizes::new([monitors.into(), 0], [correctors.into(), 0], [0, 0, sizes.supplies.into()]);
-    let frame = large::Frame::decode(&Layout { ring, room: large::SIZES }, &mut frame.to_vec())?;
+    let frame = largest::Frame::decode(&Layout { ring, room: largest::SIZES }, &mut frame.to_vec())?;
     let currents = frame.corrector.iter().take(correctors.into()).map(|code| code.value());
     let readings = frame.reading.iter().take(monitors.into()).enumerate();
     let readings = readings.map(|(b, code)| frame.valid.has(b).then(|| code.value()));

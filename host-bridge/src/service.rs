@@ -11,7 +11,7 @@ use inference::stream::{self, Core, Feedback};
 use results::output::{self, tell};
 use results::{CommandError, Names, Remarked, recording};
 use shared_memory::{FrameWriter, HealthWriter, Publisher, RequestServer, SetpointWriter};
-use training::rooms::large;
+use training::rooms::largest;
 use twin::Ring;
 
 use crate::checkpoint::{Head, Keeper};
@@ -149,7 +149,7 @@ fn setpoints(config: &Config, ring: &Ring) -> Result<Option<SetpointWriter>, Com
 
 /// Begin to put frames into the queue.
 fn start(source: &Source, ring: &Ring, queue: &Queue, stop: &Stop) -> Result<(), CommandError> {
-    let most = packet::wire_bytes(large::Frame::MAX_BYTES);
+    let most = packet::wire_bytes(largest::Frame::MAX_BYTES);
     match &source.address {
         Origin::Line(address) => feed::start(source, address, most, queue, stop),
         Origin::Recording(path) => rehearsal::start(recording(path, ring)?, source.rate(), queue, stop),

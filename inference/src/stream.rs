@@ -13,7 +13,7 @@ use estimator::{
     CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode,
     Prepared, Prior, RfCode, Sizes, StateError, TuneCode,
 };
-use training::rooms::{large, ramped};
+use training::rooms::{largest, ramped};
 use training::{Tables, in_room, in_spare_room};
 use twin::Ring;
 
@@ -145,7 +145,7 @@ impl Core {
     /// # Errors
     /// [`StreamError::Unstable`].
     pub fn in_largest_room(tables: Tables, setup: Setup) -> Result<Self, StreamError> {
-        let stream = Held::<large::Estimator, large::Steer>::boxed(&tables, &setup);
+        let stream = Held::<largest::Estimator, largest::Steer>::boxed(&tables, &setup);
         Self::holding(tables, setup, Some(stream))
     }
 
@@ -294,8 +294,8 @@ pub fn wire(recording: &Recording, row: &Row) -> Result<Vec<u8>, StreamError> {
     let encoding = |source| StreamError::Encode { recording: recording.name.clone(), sequence: row.sequence, source };
     let counts = [row.reading.len(), row.corrector_current.len(), row.supply.len()];
     let ring = Sizes::new([counts[0], 0], [counts[1], 0], [0, 0, counts[2]]);
-    let mut bytes = vec![0; large::Frame::MAX_WIRE_BYTES];
-    let n = frame(recording, row)?.encode(&Layout { ring, room: large::SIZES }, &mut bytes).map_err(encoding)?;
+    let mut bytes = vec![0; largest::Frame::MAX_WIRE_BYTES];
+    let n = frame(recording, row)?.encode(&Layout { ring, room: largest::SIZES }, &mut bytes).map_err(encoding)?;
     bytes.truncate(n);
     Ok(bytes)
 }
@@ -308,7 +308,7 @@ fn proportional_dipole(recording: &Recording, row: &Row) -> f64 {
 }
 
 /// A row in the first slots of the largest frame.
-fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> {
+fn frame(recording: &Recording, row: &Row) -> Result<largest::Frame, StreamError> {
     let beyond =
         |what, value| StreamError::Range { recording: recording.name.clone(), sequence: row.sequence, what, value };
     let current = |value| CurrentCode::nearest(value).ok_or_else(|| beyond("current", value));
@@ -321,18 +321,18 @@ fn frame(recording: &Recording, row: &Row) -> Result<large::Frame, StreamError> 
         let code = IntensityCode::nearest(particles).filter(|code| code.steps() > 0 || particles == 0.0);
         code.ok_or_else(|| beyond("intensity", particles))
     };
-    let mut frame = large::Frame {
+    let mut frame = largest::Frame {
         epoch: 0,
         sequence: row.sequence,
         time_us: time("time", row.time, u64::MAX as f64)? as u64,
         cycle_time_us: time("time in the cycle", row.cycle_time, f64::from(u32::MAX))? as u32,
-        corrector: [CurrentCode::default(); large::CORRECTORS],
+        corrector: [CurrentCode::default(); largest::CORRECTORS],
         magnets: MagnetCurrents {
             dipole: current(proportional_dipole(recording, row))?,
-            supply: [CurrentCode::default(); large::SUPPLIES],
+            supply: [CurrentCode::default(); largest::SUPPLIES],
         },
         rf_offset: RfCode::nearest(row.rf_offset).ok_or_else(|| beyond("rf offset", row.rf_offset))?,
-        reading: [PositionCode::default(); large::MONITORS],
+        reading: [PositionCode::default(); largest::MONITORS],
         tune: row.tune.map(|t| t.and_then(TuneCode::nearest)),
         intensity: row.intensity.map(intensity).transpose()?,
         valid: Mask::NONE,

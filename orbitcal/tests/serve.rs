@@ -16,7 +16,7 @@ use estimator::wire::link::Vitals;
 use firmware_sim::{Device, Event, Inbox, Panel};
 use inference::{Recording, stream};
 use shared_memory::Subscriber;
-use training::rooms::large;
+use training::rooms::largest;
 
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
 
@@ -182,8 +182,8 @@ fn flip(byte: &mut u8) -> Option<u32> {
 
 /// The setup as a host sends it, in packets that are the same for a machine of any size.
 fn restart(setup: &stream::Setup) -> Vec<u8> {
-    let mut bytes = vec![0; large::PACKET];
-    let n = large::Request::Restart(setup.on_wire()).encode(1, &mut bytes).unwrap();
+    let mut bytes = vec![0; largest::PACKET];
+    let n = largest::Request::Restart(setup.on_wire()).encode(1, &mut bytes).unwrap();
     bytes.truncate(n);
     bytes
 }

@@ -9,7 +9,7 @@ use inference::stream::{self, Core};
 use inference::{Campaign, Lack, Recording};
 use schemars::JsonSchema;
 use serde::Serialize;
-use training::rooms::large;
+use training::rooms::largest;
 use twin::{Hold, Optics, Ring, Tunes};
 
 use crate::campaign::{campaign, not_modelled, strays};
@@ -259,7 +259,7 @@ fn device(campaign: &Campaign) -> Usable {
     let Ok(wire) = stream::wire(recording, &recording.rows[0]) else {
         return Usable { command: "device", can: false, what: "a frame cannot carry its values".into() };
     };
-    let can = training::green::sizes(&campaign.ring).is_ok_and(|sizes| large::SIZES.hold(&sizes));
+    let can = training::green::sizes(&campaign.ring).is_ok_and(|sizes| largest::SIZES.hold(&sizes));
     let milliseconds = wire.len() as f64 * LINE.1 / LINE.0 * 1e3;
     let what = format!(
         "{} bytes a frame, {milliseconds:.1} ms at {} baud; make firmware builds the image, and says whether it fits",

@@ -8,7 +8,7 @@ use std::path::Path;
 use estimator::wire::link::UNASKED;
 use estimator::{FrameError, Parcel, ParcelError, Tables as _};
 use training::green::{Difference, difference};
-use training::rooms::large::{PACKET, Request};
+use training::rooms::largest::{PACKET, Request};
 use training::{AnyParcel, LINE, Tables, TrainingError};
 use twin::Ring;
 use twin::limits::FILE;

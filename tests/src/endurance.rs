@@ -7,7 +7,7 @@ use estimator::wire::link::{Form, Short, Status};
 use host_bridge::source::link::{Link, LinkError};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
-use training::rooms::large::{Reply, Request, Setpoints};
+use training::rooms::largest::{Reply, Request, Setpoints};
 use twin::Ring;
 
 use crate::faults::{FAULTS, faulty};

@@ -135,8 +135,8 @@ fn start(core: &Core) -> Vec<Option<u8>> {
 
 /// As a host that talks to devices of any size.
 fn restart(setup: &stream::Setup) -> Vec<Option<u8>> {
-    let mut bytes = vec![0; rooms::large::PACKET];
-    let n = rooms::large::Request::Restart(setup.on_wire()).encode(1, &mut bytes).unwrap();
+    let mut bytes = vec![0; rooms::largest::PACKET];
+    let n = rooms::largest::Request::Restart(setup.on_wire()).encode(1, &mut bytes).unwrap();
     heard(&bytes[..n])
 }
 
@@ -151,7 +151,7 @@ fn in_flash(tables: &Tables) -> Box<Green> {
 fn estimate_of(sent: &Answer) -> Estimate {
     let mut bytes = vec![0; PACKET];
     let n = Reply::Estimate(sent.clone()).encode(UNASKED, &mut bytes).unwrap();
-    let (UNASKED, Ok(rooms::large::Reply::Estimate(sent))) = rooms::large::Reply::decode(&mut bytes[..n]) else {
+    let (UNASKED, Ok(rooms::largest::Reply::Estimate(sent))) = rooms::largest::Reply::decode(&mut bytes[..n]) else {
         panic!("another reply")
     };
     Estimate::of_answer(&sent).unwrap()

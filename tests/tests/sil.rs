@@ -21,7 +21,7 @@ use system_tests::qemu::{Emulator, Image, Options};
 use system_tests::repository;
 use system_tests::sil::{bits, compare, largest};
 use training::LINE;
-use training::rooms::large::{PACKET, Reply, Request};
+use training::rooms::largest::{PACKET, Reply, Request};
 use twin::{Effect, Ring};
 
 /// Built once for all tests.

@@ -3,7 +3,7 @@
 use estimator::Tables as _;
 use estimator::surrogate::Network as Core;
 use nalgebra::DMatrix;
-use twin::{Hold, Optics, Parameter, ParameterPrior, Ring};
+use twin::{Hold, Optics, Parameter, ParameterPrior, Ring, sobol};
 
 use crate::instruments::Instruments;
 use crate::network::layers::Network;
@@ -45,13 +45,11 @@ const WIDTHS: f64 = 2.0;
 const FULL_SWING: f64 = 0.4e-3;
 
 /// Vars at point `i` of a scrambled Sobol sequence [N].
-///
-/// Source: B. Burley, Practical Hash-based Owen Scrambling, JCGT 9 (2020).
 fn sobol_vars(i: u32, ring: &Ring, seed: u32) -> Vec<f64> {
     let of = |(n, parameter): (usize, &Parameter)| {
         let ParameterPrior { width, range: [lowest, highest] } = parameter.prior;
         let (from, to) = (lowest.max(1.0 - WIDTHS * width), highest.min(1.0 + WIDTHS * width));
-        from + (to - from) * f64::from(sobol_burley::sample(i, n as u32, seed))
+        from + (to - from) * sobol(i, n, seed)
     };
     ring.parameters.iter().enumerate().map(of).collect()
 }

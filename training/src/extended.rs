@@ -175,6 +175,8 @@ fn complete(tables: &mut Tables, remainder: DMatrix<f64>) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use twin::sobol;
+
     use super::*;
 
     fn effects(words: &[&str]) -> Vec<Effect> {
@@ -183,7 +185,7 @@ mod tests {
 
     /// Vars of a machine, seeded by `i`, this far from 1.
     fn vars(i: u32, width: [f64; 2]) -> Vec<f64> {
-        let uniform = |q| f64::from(sobol_burley::sample(i, q, 7)) - 0.5;
+        let uniform = |q| sobol(i, q, 7) - 0.5;
         (0..48).map(|q| 1.0 + width[usize::from(q >= 24)] * 12f64.sqrt() * uniform(q)).collect()
     }
 

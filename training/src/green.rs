@@ -94,7 +94,7 @@ pub fn sizes(ring: &Ring) -> Result<Sizes, TrainingError> {
         "params",
         "supplies",
     ];
-    let each = what.into_iter().zip(sizes.all()).zip(rooms::large::SIZES.all());
+    let each = what.into_iter().zip(sizes.all()).zip(rooms::largest::SIZES.all());
     match each.into_iter().find(|((_, found), most)| found > most) {
         Some(((what, found), most)) => Err(TrainingError::Room { ring: ring.name.clone(), what, most, found }),
         None => Ok(sizes),

@@ -8,6 +8,7 @@
 //! | medium | 64 + 64 | 64 + 64 | 96 | 8 |
 //! | wide | 128 + 128 | 128 + 128 | 128 | 8 |
 //! | large | 128 + 128 | 128 + 128 | 256 | 16 |
+//! | largest | 384 + 384 | 384 + 384 | 512 | 16 |
 //! | along a ramp | 24 + 24, at four times in the cycle | 24 + 24 | 48 | 4 |
 
 pub use estimator::booster;
@@ -30,10 +31,16 @@ pub mod wide {
     estimator::machine!(monitors: [128, 128], correctors: [128, 128], quadrupoles: 128, params: 128, supplies: 8);
 }
 
-/// The largest.
+/// Synchrotrons of some hundred quadrupoles.
 #[allow(missing_docs)] // those of `estimator::machine!`
 pub mod large {
     estimator::machine!(monitors: [128, 128], correctors: [128, 128], quadrupoles: 256, params: 256, supplies: 16);
+}
+
+/// Rings of kilometres.
+#[allow(missing_docs)] // those of `estimator::machine!`
+pub mod largest {
+    estimator::machine!(monitors: [384, 384], correctors: [384, 384], quadrupoles: 512, params: 512, supplies: 16);
 }
 
 /// Rings of a dozen cells whose machine file has a ramp: baselines for four times in the cycle.
@@ -80,6 +87,9 @@ macro_rules! in_spare_room {
             Some($body)
         } else if $crate::rooms::large::SIZES.hold(&sizes) {
             use $crate::rooms::large as $room;
+            Some($body)
+        } else if $crate::rooms::largest::SIZES.hold(&sizes) {
+            use $crate::rooms::largest as $room;
             Some($body)
         } else {
             None

@@ -7,7 +7,7 @@ use nalgebra::DMatrix;
 use crate::rooms;
 
 /// Entries of the longest line of any room's tables.
-pub const LINE: usize = rooms::large::LINE;
+pub const LINE: usize = rooms::largest::LINE;
 
 /// A part of tables, of any room.
 pub type AnyParcel = Parcel<LINE>;
@@ -184,7 +184,7 @@ impl estimator::Tables for Tables {
         codes: [const { Vec::new() }; Table::ALL.len()],
         lists: [const { Vec::new() }; List::ALL.len()],
     };
-    const ROOM: Sizes = rooms::large::SIZES;
+    const ROOM: Sizes = rooms::largest::SIZES;
 
     fn layout(&self) -> Layout {
         Layout { ring: self.sizes, room: self.sizes }

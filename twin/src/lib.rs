@@ -24,6 +24,7 @@ mod orbit;
 mod response;
 mod ripple;
 mod site;
+mod sobol;
 mod spurious;
 #[cfg(test)]
 mod testing;
@@ -47,6 +48,7 @@ pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source};
 pub use ripple::ripple_of_misaligned;
 pub use site::Site;
+pub use sobol::sobol;
 pub use spurious::{SHARED, spurious_dispersion};
 pub use tune::Tunes;
 pub use twiss::Twiss;

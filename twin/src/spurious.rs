@@ -7,11 +7,14 @@ use crate::lattice::{Plane, Ring};
 use crate::map::{DELTA, X, Y};
 use crate::orbit::{ClosedOrbit, Hold, OrbitError};
 use crate::response::Optics;
+use crate::sobol::sobol;
 
 /// Misaligned machines that are tried, and the rms shift of their quadrupoles [m]; the ratio to the orbit does not depend on
 /// the shift.
 const MACHINES: u32 = 40;
 const SHIFT: f64 = 0.2e-3;
+/// Of their Sobol points.
+const SEED: u32 = 1;
 /// A ring of a small slip factor keeps its frequency with a large momentum, and may lose the orbit: its quadrupoles are shifted less, but not
 /// by less than this [m].
 const LEAST_SHIFT: f64 = 1e-7;
@@ -63,16 +66,10 @@ pub(crate) fn misaligned(ring: &Ring, machine: u32, rms: f64) -> Ring {
     let mut shifted = ring.clone();
     for (q, at) in ring.quadrupoles.iter().map(|q| q.element).enumerate() {
         let shift = &mut shifted.elements[at].misalignment;
-        let uniform = |plane: u32| (sobol(machine, 2 * q as u32 + plane) - 0.5) * rms * 12f64.sqrt();
+        let uniform = |plane| (sobol(machine, 2 * q + plane, SEED) - 0.5) * rms * 12f64.sqrt();
         (shift.dx, shift.dy) = (uniform(0), uniform(1));
     }
     shifted
-}
-
-/// A coordinate of a Sobol point in 0..1; beyond the dimensions of one sequence another one goes on.
-fn sobol(point: u32, dimension: u32) -> f64 {
-    let (sequence, dimension) = (dimension / sobol_burley::NUM_DIMENSIONS, dimension % sobol_burley::NUM_DIMENSIONS);
-    f64::from(sobol_burley::sample(point, dimension, 1 + sequence))
 }
 
 #[cfg(test)]
@@ -96,7 +93,7 @@ mod tests {
         let mut ring = Ring::booster();
         let one = ring.quadrupoles[0];
         ring.quadrupoles = vec![one; 300];
-        let shifts: Vec<f64> = (0..300).map(|q| sobol(3, 2 * q)).collect();
+        let shifts: Vec<f64> = (0..300).map(|q| sobol(3, 2 * q, SEED)).collect();
         let equal = (0..300).filter(|&i| shifts[..i].contains(&shifts[i])).count();
         assert_eq!(equal, 0);
         assert!(misaligned(&ring, 3, SHIFT).elements[one.element].misalignment.dx != 0.0);

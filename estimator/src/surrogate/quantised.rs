@@ -36,9 +36,10 @@ impl<const R: usize> Column<R> {
     /// All zero.
     pub const ZERO: Self = Self { scale: 0.0, codes: [0; R] };
 
-    /// Sum of the squared values.
-    pub fn squares(&self) -> f32 {
-        let sum: f32 = self.codes.iter().map(|code| f32::from(*code) * f32::from(*code)).sum();
+    /// Sum of the squared values of some rows.
+    pub fn squares(&self, rows: impl Iterator<Item = usize>) -> f32 {
+        let codes = rows.filter_map(|row| self.codes.get(row));
+        let sum: f32 = codes.map(|code| f32::from(*code) * f32::from(*code)).sum();
         self.scale * self.scale * sum
     }
 

@@ -17,7 +17,7 @@ use crate::source::desk::Wish;
 use crate::source::queue::{Arrived, Queue};
 
 /// What the posterior expects of readings is worked out as often as this.
-const FITTED: Duration = Duration::from_millis(200);
+const FITTED: Duration = Duration::from_millis(90);
 
 /// Readings are compared with the model as often as this, by the time of frames [us]: that takes as long as several frames while vars do
 /// not walk.

@@ -7,7 +7,7 @@ use estimator::FitQuality;
 use inference::{Recording, stream};
 use results::output::warn;
 use results::{EstimateRecord, Names};
-use training::rooms::large::Request;
+use training::rooms::largest::Request;
 
 use super::link::{Heard, Link, LinkError};
 use super::{Clock, Next, Source, SourceError, Times};

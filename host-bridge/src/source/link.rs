@@ -11,7 +11,7 @@ use std::time::Instant;
 use estimator::wire::link::{Form, Refusal, Short, Status, Taken, UNASKED};
 use estimator::{FrameError, ParcelError, Tables as _};
 use inference::stream::{Estimate, Setup};
-use training::rooms::large::{Feedback, PACKET, Reply, Request, Setpoints};
+use training::rooms::largest::{Feedback, PACKET, Reply, Request, Setpoints};
 use training::{LINE, Tables};
 
 use super::address::Address;

@@ -12,7 +12,7 @@ use firmware_sim::machine::{BUILT_IN, Estimator, LINE, Steer, Tables};
 use firmware_sim::{Device, Event, Inbox};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
-use training::rooms::large;
+use training::rooms::largest;
 use twin::Ring;
 
 use super::{Target, repository};
@@ -52,13 +52,13 @@ static REQUESTS: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
     let ring = Ring::booster();
     let setup = stream::setup(&RECORDING.powered(&ring), &RECORDING, Walk::NONE).expect("a good recording");
     let tables = training::green::tables(&ring).expect("the built-in ring has tables");
-    let parcels = tables.parcels::<{ training::LINE }>().map(large::Request::Model);
-    let all = [large::Request::Restart(setup.on_wire()), large::Request::Status, large::Request::Covariance];
+    let parcels = tables.parcels::<{ training::LINE }>().map(largest::Request::Model);
+    let all = [largest::Request::Restart(setup.on_wire()), largest::Request::Status, largest::Request::Covariance];
     all.into_iter().chain(parcels).map(|request| encoded(|to| request.encode(1, to))).collect()
 });
 
 fn encoded(encode: impl FnOnce(&mut [u8]) -> Result<usize, estimator::FrameError>) -> Vec<u8> {
-    let mut bytes = vec![0; large::PACKET];
+    let mut bytes = vec![0; largest::PACKET];
     let length = encode(&mut bytes).expect("a packet has room for it");
     bytes.truncate(length);
     bytes
@@ -137,7 +137,7 @@ fn device(bytes: &[u8]) -> bool {
     let (mut core, mut steer) = (Box::new(Estimator::BLANK), Box::new(Steer::BLANK));
     let mut slot = Box::new(Tables::BLANK);
     let mut device = Device::<_, _, LINE>::new(&mut *core, &mut *steer, &BUILT_IN, &mut *slot);
-    let (mut inbox, all) = (Inbox::<{ large::PACKET }>::default(), [&setup, bytes, &WIRES[0], &WIRES[1]].concat());
+    let (mut inbox, all) = (Inbox::<{ largest::PACKET }>::default(), [&setup, bytes, &WIRES[0], &WIRES[1]].concat());
     let mut source = all.as_slice();
     loop {
         match inbox.next(&mut source).expect("memory does not fail") {

@@ -1,7 +1,7 @@
 //! The estimate of a core after a frame, for a ring of any size.
 
 use estimator::{Health, Layout, Marginal, Mask, MonitorState, Prior, Remarks};
-use training::rooms::large;
+use training::rooms::largest;
 
 /// The vars and the state of the monitors after a frame: [`estimator::Estimate`] without spare slots.
 #[derive(Debug, Clone, PartialEq)]
@@ -78,7 +78,7 @@ impl Estimate {
     }
 
     /// That of a device of any size, if every list of its reply is complete.
-    pub fn of_answer(answer: &large::Answer) -> Option<Self> {
+    pub fn of_answer(answer: &largest::Answer) -> Option<Self> {
         let (params, monitors) = (answer.mean.len(), answer.health.len());
         let lists = [&answer.sigma, &answer.map_params, &answer.centre, &answer.params_sigma];
         let masks = [&answer.accepted, &answer.rejected, &answer.confirmed, &answer.restarted];
@@ -89,7 +89,7 @@ impl Estimate {
             return None;
         }
         let bits = |words: &[u32], count| {
-            let mask = Mask::<{ large::WORDS }>::from_words(words);
+            let mask = Mask::<{ largest::WORDS }>::from_words(words);
             (0..count).map(|i| mask.has(i)).collect::<Vec<bool>>()
         };
         let health = |&(state, noise, weighted_as, rejected): &(u8, f32, f32, u32)| {

@@ -79,7 +79,7 @@ where
     }
 }
 
-/// A core, its tables and its setup. Boxed: the Booster's state is some 150 kB, the largest some 6 MB.
+/// A core, its tables and its setup. Boxed: the Booster's state is some 150 kB, the largest some 42 MB.
 pub struct Held<E: Core, S: Steers<E>> {
     tables: Box<E::Tables>,
     setup: E::Setup,

@@ -1,7 +1,7 @@
 //! Priors, noise and calibration of a core, for a ring of any size.
 
 use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, Ramp, RampPoint, SupplyCalibration, Walk};
-use training::rooms::large;
+use training::rooms::largest;
 use twin::Ring;
 
 use super::StreamError;
@@ -88,7 +88,7 @@ fn priors(ring: &Ring) -> Result<[Prior; GROUPS], StreamError> {
 
 impl Setup {
     /// As it travels to a device of exactly the ring's sizes.
-    pub fn on_wire(&self) -> large::Setup {
+    pub fn on_wire(&self) -> largest::Setup {
         let mut setup = self.sized(|b| b, |c| c);
         setup.calibration.supplies.truncate(self.supplies.len());
         setup.calibration.ramp.points.iter_mut().for_each(|point| point.gradient.truncate(self.supplies.len()));

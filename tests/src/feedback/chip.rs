@@ -11,7 +11,7 @@ use estimator::booster::{self, Estimate, Estimator, Feedback};
 use estimator::wire::link::{Form, Short, Status};
 use host_bridge::source::link::{Heard, Link, LinkError};
 use inference::stream;
-use training::rooms::large::{self, Setpoints};
+use training::rooms::largest::{self, Setpoints};
 
 use super::Known;
 use crate::machine::LAYOUT;
@@ -144,8 +144,8 @@ fn says(said: &Short<Setpoints>, own: &Short<booster::Setpoints>) -> bool {
 }
 
 /// As a host sends it, which talks to devices of any size.
-pub fn on_wire(feedback: &Feedback) -> large::Feedback {
-    large::Feedback {
+pub fn on_wire(feedback: &Feedback) -> largest::Feedback {
+    largest::Feedback {
         orbit: wide(&feedback.orbit),
         walk: feedback.walk,
         step_kick: feedback.step_kick,

@@ -5,7 +5,7 @@ use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
-use twin::{Hold, Optics, Ring, VariedRing};
+use twin::{Hold, Optics, Ring, VariedRing, sobol};
 
 use super::settings::of_var;
 
@@ -94,13 +94,13 @@ impl Source {
     /// of one Sobol sequence.
     pub fn samples(&self, machines: usize, seed: u64) -> [Samples; 2] {
         let mut random = StdRng::seed_from_u64(seed);
-        let sobol = random.random::<u32>();
-        let drawn: Vec<_> = (0..).filter_map(|i| self.draw(i, sobol)).take(machines).collect();
+        let scramble = random.random::<u32>();
+        let drawn: Vec<_> = (0..).filter_map(|i| self.draw(i, scramble)).take(machines).collect();
         [0, 1].map(|plane| self.of_plane(&drawn, plane, &mut random))
     }
 
     fn draw(&self, i: u32, seed: u32) -> Option<Drawn> {
-        let point = |d: usize| f64::from(sobol_burley::sample(i, d as u32, seed));
+        let point = |d| sobol(i, d, seed);
         let params = self.ring.parameters.len();
         let vars: Vec<f64> = (0..params).map(|d| 1.0 + f64::from(SPAN) * (2.0 * point(d) - 1.0)).collect();
         // evenly over as wide a range as three of the normal's widths
