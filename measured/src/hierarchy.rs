@@ -370,10 +370,10 @@ impl Start {
         let places = Places::of(&self.unknowns, rows, columns);
         let scene = Scene { model, places, width: each(|one| one.width), mean: each(|one| one.mean) };
         let mut prediction = model.predict(&self.unknowns, &self.values)?;
-        let (mut damping, mut followed) = (DAMPING, DMatrix::zeros(0, 0));
+        let (mut damping, mut followed, mut curvature) = (DAMPING, DMatrix::zeros(0, 0), None);
         for round in 1..=rounds {
             progress(&format!("families, round {round} of {rounds}"));
-            let here = self.linearise(&scene, &prediction);
+            let here = self.linearise(&scene, &prediction, None);
             let share = if round < rounds { NONLINEAR } else { 0.0 };
             let (posterior, gained) = here.posterior(&self.families)?.learn(&mut self.families, share)?;
             let promised;
@@ -389,10 +389,12 @@ impl Start {
             }
             (self.noise, _) = self.noise.learnt(&self.data, &left, &followed);
             if gained + promised < SETTLED {
+                // so small a step leaves the curvature as it is
+                curvature = Some(here.information);
                 break;
             }
         }
-        let here = self.linearise(&scene, &prediction);
+        let here = self.linearise(&scene, &prediction, curvature);
         let (posterior, _) = here.posterior(&self.families)?.learn(&mut self.families, 0.0)?;
         let covariance = times(posterior.covariance.clone(), &scene.width);
         let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
@@ -415,14 +417,16 @@ impl Start {
         })
     }
 
-    fn linearise(&self, scene: &Scene, prediction: &Prediction) -> Linearised {
+    /// About a prediction, with a curvature that is known or is made.
+    fn linearise(&self, scene: &Scene, prediction: &Prediction, curvature: Option<DMatrix<f64>>) -> Linearised {
         let n = self.unknowns.len();
         let residual = self.data.residual(prediction);
         let weight = self.data.weight(&self.noise, &residual);
         let slope = scene.places.back(prediction, &weight.component_mul(&residual));
         let expected = &scene.mean + means(&self.families, n).component_mul(&scene.width);
         Linearised {
-            information: times(scene.places.information(prediction, &weight), &scene.width),
+            information: curvature
+                .unwrap_or_else(|| times(scene.places.information(prediction, &weight), &scene.width)),
             slope: slope.component_mul(&scene.width),
             off: (&self.values - &expected).component_div(&scene.width),
             residual,
