@@ -1,24 +1,52 @@
 "use strict";
-// Asks the daemon once a second for its numbers, and draws them. Nothing is sent, nothing is fetched from elsewhere.
+// Asks the daemon for its numbers as often as it has new ones, and draws them. Nothing is sent, nothing is fetched from elsewhere.
 
 const $ = (id) => document.getElementById(id);
 let ring = null;      // names and places, asked once
 let chosen = null;    // name of the var of the history
-let last = null;      // the last numbers
+let last = null;      // the last numbers, each with its name and place
 let failed = 0;       // how often in a row the daemon did not reply
 
-const node = (name, attributes = {}, text) => {
-  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text !== undefined) made.textContent = text;
-  return made;
-};
-const picture = (width, height, says) => node("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": says });
-const put = (id, svg) => $(id).replaceChildren(svg);
+// A node as it is wanted, with text or other nodes inside. Less than a tenth of a pixel is not seen.
+function node(name, attributes = {}, inside = []) {
+  for (const key in attributes) if (typeof attributes[key] === "number") attributes[key] = Math.round(10 * attributes[key]) / 10;
+  return { name, attributes, inside };
+}
+
+// The nodes in a parent are made once; later only what differs is set.
+function fill(parent, wanted) {
+  const nodes = wanted.filter(Boolean);
+  let there = parent.firstElementChild;
+  for (const each of nodes) {
+    if (there?.localName !== each.name) {
+      const made = document.createElementNS(each.name === "svg" ? "http://www.w3.org/2000/svg" : parent.namespaceURI, each.name);
+      if (there) there.replaceWith(made); else parent.append(made);
+      there = made;
+    }
+    update(there, each);
+    there = there.nextElementSibling;
+  }
+  while (parent.childElementCount > nodes.length) parent.lastElementChild.remove();
+}
+
+function update(there, { attributes, inside }) {
+  const before = there.wanted ?? { attributes: {} };
+  for (const key in attributes) if (attributes[key] !== before.attributes[key]) there.setAttribute(key, attributes[key]);
+  for (const key in before.attributes) if (!(key in attributes)) there.removeAttribute(key);
+  if (Array.isArray(inside)) fill(there, inside);
+  else if (inside !== before.inside) there.textContent = inside;
+  there.wanted = { attributes, inside };
+}
+
+const picture = (width, height, label, inside) => node("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": label }, inside);
 const span = (seconds) => seconds < 1 ? `${Math.round(1e3 * seconds)} ms` : seconds < 120 ? `${Math.round(seconds)} s` : seconds < 7200 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
 const micro = (us) => us < 1000 ? `${us} µs` : `${(us / 1000).toFixed(1)} ms`;
+const fixed = (number, digits) => number == null ? "–" : number.toFixed(digits);
 const count = (number) => Number(number).toLocaleString("en-GB").replaceAll(",", " ");
-const kind = ([mean, sigma]) => Math.abs(mean - 1) < 2 * sigma ? "usual" : mean < 1 ? "weak" : "strong";
+const kind = ({ mean, sigma }) => Math.abs(mean - 1) < 2 * sigma ? "usual" : mean < 1 ? "weak" : "strong";
+const inWords = ({ name, mean, sigma }) => `${name}: ${mean.toFixed(4)} ± ${sigma.toFixed(4)}`;
+const isKnown = ({ mean, sigma }) => mean !== null && sigma !== null;
+const isOk = ({ state }) => state === "ok";
 const width = (id) => Math.max(300, Math.round($(id).clientWidth || 560));
 
 // Round steps between two ends, about so many.
@@ -30,12 +58,21 @@ function ticks(low, high, wanted) {
   return all;
 }
 
+// Labels that cover none of those before them.
+function clear(labels) {
+  const kept = [];
+  for (const label of labels) {
+    const isFree = (other) => Math.abs(other.x - label.x) >= (other.wide + label.wide) / 2 || Math.abs(other.y - label.y) >= (other.high + label.high) / 2;
+    if (kept.every(isFree)) kept.push(label);
+  }
+  return kept;
+}
+
 function verdict(state) {
-  const stale = state.age_s !== null && state.age_s > 10;
-  const say = (kind, words) => { $("verdict").className = kind; $("verdict").textContent = words; };
+  const say = (kind, words) => update($("verdict"), node("p", { class: kind }, words));
   if (failed > 2) return say("bad", "The daemon does not reply: it has ended, or the connection to it is broken. What follows is old.");
   if (!state.vars) return say("waits", "Waiting for the first estimate.");
-  if (stale) return say("bad", `No estimate for ${span(state.age_s)}: no frames come. What follows is old.`);
+  if (state.age_s > 10) return say("bad", `No estimate for ${span(state.age_s)}: no frames come. What follows is old.`);
   if (state.mismatch) return say("bad", "Readings and model disagree by more than noise explains: do not act on these numbers. `orbitcal diagnose` says what the model may lack.");
   if (!state.usable) return say("bad", `The last estimate is not usable${state.remarks.length ? ` (${state.remarks.join(", ")})` : ""}.`);
   say("good", "Readings and model agree; the estimate is usable.");
@@ -44,153 +81,130 @@ function verdict(state) {
 function numbers(state) {
   const lost = state.faults.dropped;
   const all = [
-    ["frames a second", state.rate_hz == null ? "–" : state.rate_hz >= 100 ? Math.round(state.rate_hz) : state.rate_hz.toFixed(1)],
+    ["frames a second", fixed(state.rate_hz, state.rate_hz >= 100 ? 0 : 1)],
     ["age of the estimate", state.age_s === null ? "–" : span(state.age_s), state.age_s > 10],
     ["frame to estimate, median", state.latency_us ? micro(state.latency_us[0]) : "–"],
     ["of 99 %, within", state.latency_us ? micro(state.latency_us[1]) : "–"],
-    ["chi² per degree of freedom", state.degrees_of_freedom > 0 ? (state.chi_square / state.degrees_of_freedom).toFixed(3) : "–", state.mismatch],
+    ["chi² per degree of freedom", state.chi_square != null && state.degrees_of_freedom > 0 ? (state.chi_square / state.degrees_of_freedom).toFixed(3) : "–", state.mismatch],
     ["frames in the estimate", state.frames === undefined ? "–" : count(state.frames)],
     ["frames waiting", count(state.queue)],
     ["frames dropped", count(lost), lost > 0],
   ];
-  $("numbers").replaceChildren(...all.map(([name, value, bad]) => {
-    const pair = document.createElement("div");
-    const [dt, dd] = [document.createElement("dt"), document.createElement("dd")];
-    [dt.textContent, dd.textContent, pair.className] = [name, value, bad ? "bad" : ""];
-    pair.append(dt, dd);
-    return pair;
-  }));
+  fill($("numbers"), all.map(([name, value, bad]) => node("div", { class: bad ? "bad" : "" }, [node("dt", {}, name), node("dd", {}, value)])));
 }
 
-// Vars as rows, in as many columns as there is room for, all on one scale.
-function vars(state) {
-  const names = ring.place.vars.map((spot) => spot.name);
-  const wide = width("vars"), columns = Math.max(1, Math.min(3, Math.floor(wide / 190)));
-  const rows = Math.ceil(names.length / columns), line = 15, top = 18;
-  const reach = Math.max(0.02, ...state.vars.map(([mean, sigma]) => mean === null ? 0 : Math.min(0.2, Math.abs(mean - 1) + 2 * sigma)));
-  const svg = picture(wide, top + rows * line + 4, "Strength factors against nominal");
-  const column = wide / columns, left = 9 * Math.max(...names.map((name) => name.length)) + 6, right = 10;
+// Vars as rows, in as many columns as there is room for, all on one scale, which stays above them.
+function vars(state, wide) {
+  const columns = Math.max(1, Math.min(3, Math.floor(wide / 190)));
+  const rows = Math.ceil(state.vars.length / columns), line = 15, top = 18;
+  const reach = Math.max(0.02, ...state.vars.filter(isKnown).map(({ mean, sigma }) => Math.min(0.2, Math.abs(mean - 1) + 2 * sigma)));
+  const column = wide / columns, left = 9 * Math.max(...state.vars.map(({ name }) => name.length)) + 6, right = 10;
   const at = (c, value) => c * column + left + (column - left - right) * (0.5 + 0.5 * Math.max(-1, Math.min(1, (value - 1) / reach)));
-  for (let c = 0; c < columns; c++) {
-    for (const tick of ticks(1 - reach, 1 + reach, 5)) {
-      svg.append(node("line", { class: tick === 1 ? "nominal" : "axis", x1: at(c, tick), x2: at(c, tick), y1: top - 3, y2: top + rows * line }));
-      svg.append(node("text", { class: "pale", x: at(c, tick), y: 11, "text-anchor": "middle" }, String(tick)));
-    }
-  }
-  names.forEach((name, i) => {
-    const [mean, sigma] = state.vars[i];
-    if (mean === null) return;
-    const c = Math.floor(i / rows), y = top + (i % rows) * line + line / 2, look = kind(state.vars[i]);
-    const link = node("a", { class: name === chosen ? "chosen" : "", tabindex: 0, role: "button" });
-    link.append(node("title", {}, `${name}: ${mean.toFixed(4)} ± ${sigma.toFixed(4)}`));
-    link.append(node("rect", { class: "pick", x: c * column, y: y - line / 2, width: column - 4, height: line }));
-    link.append(node("text", { x: c * column + 4, y: y + 4 }, name));
-    link.append(node("line", { class: look, x1: at(c, mean - 2 * sigma), x2: at(c, mean + 2 * sigma), y1: y, y2: y, "stroke-width": 1 }));
-    link.append(node("line", { class: look, x1: at(c, mean - sigma), x2: at(c, mean + sigma), y1: y, y2: y, "stroke-width": 4 }));
-    link.append(node("circle", { class: look, cx: at(c, mean), cy: y, r: 3 }));
-    const choose = () => { chosen = name; $("var").value = name; vars(last); trail(); };
-    link.addEventListener("click", choose);
-    link.addEventListener("keydown", (event) => { if (event.key === "Enter") choose(); });
-    svg.append(link);
+  const scale = Array.from({ length: columns }, (_, c) => ticks(1 - reach, 1 + reach, 5).map((tick) => ({ tick, x: at(c, tick) }))).flat();
+  const grid = (y1, y2) => scale.map(({ tick, x }) => node("line", { class: tick === 1 ? "nominal" : "axis", x1: x, x2: x, y1, y2 }));
+  const links = state.vars.map((each, i) => {
+    const { name, mean, sigma } = each, look = kind(each), c = Math.floor(i / rows), y = (i % rows) * line + line / 2;
+    return isKnown(each) && node("a", { class: name === chosen ? "chosen" : "", tabindex: 0, role: "button", "data-var": name }, [
+      node("title", {}, inWords(each)),
+      node("rect", { class: "pick", x: c * column, y: y - line / 2, width: column - 4, height: line }),
+      node("text", { x: c * column + 4, y: y + 4 }, name),
+      node("line", { class: look, x1: at(c, mean - 2 * sigma), x2: at(c, mean + 2 * sigma), y1: y, y2: y, "stroke-width": 1 }),
+      node("line", { class: look, x1: at(c, mean - sigma), x2: at(c, mean + sigma), y1: y, y2: y, "stroke-width": 4 }),
+      node("circle", { class: look, cx: at(c, mean), cy: y, r: 3 }),
+    ]);
   });
-  put("vars", svg);
+  fill($("vars"), [
+    picture(wide, top, "Scale", [...grid(top - 3, top), ...scale.map(({ tick, x }) => node("text", { class: "pale", x, y: 11, "text-anchor": "middle" }, tick))]),
+    picture(wide, rows * line + 4, "Strength factors against nominal", [...grid(0, rows * line), ...links]),
+  ]);
 }
 
-function map(state) {
-  const size = Math.min(width("ring"), 560), middle = size / 2, radius = 0.33 * size;
-  const svg = picture(size, size, "The ring");
+// Where many marks share a circle they are smaller, and correctors lie on several circles.
+function map(state, wide) {
+  const size = Math.min(wide, 560), middle = size / 2, radius = 0.33 * size;
   const at = (s, r) => { const angle = 2 * Math.PI * s / ring.place.circumference; return [middle + r * Math.sin(angle), middle - r * Math.cos(angle)]; };
-  svg.append(node("circle", { class: "axis", cx: middle, cy: middle, r: radius }));
-  const reach = Math.max(0.02, ...state.vars.map(([mean]) => mean === null ? 0 : Math.abs(mean - 1)));
-  ring.place.vars.forEach((spot, i) => {
-    const [mean] = state.vars[i];
-    if (mean === null) return;
-    for (const s of spot.s) {
-      const [x1, y1] = at(s, radius), [x2, y2] = at(s, radius * (1 + 0.2 * (mean - 1) / reach));
-      const bar = node("line", { class: kind(state.vars[i]), x1, y1, x2, y2, "stroke-width": 4 });
-      bar.append(node("title", {}, `${spot.name}: ${mean.toFixed(4)} ± ${state.vars[i][1].toFixed(4)}`));
-      svg.append(bar);
-    }
+  const pitch = (spots, r) => 2 * Math.PI * r / new Set(spots.flatMap(({ s }) => s)).size;
+  const known = state.vars.filter(isKnown), thick = Math.min(4, 0.7 * pitch(state.vars, radius));
+  const reach = Math.max(0.02, ...known.map(({ mean }) => Math.abs(mean - 1)));
+  const bars = known.flatMap((each) => each.s.map((s) => {
+    const [x1, y1] = at(s, radius), [x2, y2] = at(s, radius * (1 + 0.2 * (each.mean - 1) / reach));
+    return node("line", { class: kind(each), x1, y1, x2, y2, "stroke-width": thick }, [node("title", {}, inWords(each))]);
+  }));
+  const dot = Math.min(2.5, 0.4 * pitch(state.monitors, 1.22 * radius)), dense = pitch(state.correctors, 0.78 * radius);
+  const circles = Math.ceil(3 / dense), triangle = Math.min(2.5, 0.4 * circles * dense);
+  const look = (each, r) => ({ class: isOk(each) ? "usual hollow" : "faulty", r: isOk(each) ? r : Math.max(3, 2 * r), "stroke-width": r / 2.5 });
+  const title = ({ name, state }) => [node("title", {}, `${name}: ${state}`)];
+  const dots = state.monitors.map((each) => {
+    const [cx, cy] = at(each.s[0], radius * (each.name.startsWith("y") ? 1.27 : 1.22));
+    return node("circle", { ...look(each, dot), cx, cy }, title(each));
+  });
+  const triangles = state.correctors.map((each, i) => {
+    const [x, y] = at(each.s[0], (0.78 - 0.04 * (i % circles)) * radius), { r, ...rest } = look(each, triangle);
+    return node("path", { ...rest, d: `M${x} ${y - r}L${x + r} ${y + r}L${x - r} ${y + r}Z` }, title(each));
   });
   // outside of its mark, on either side
-  const label = (spot, s, r) => {
-    const [x, y] = at(s, r), aside = (x - middle) / r * Math.sign(r - radius);
-    const anchor = Math.abs(aside) < 0.4 ? "middle" : aside > 0 ? "start" : "end";
-    svg.append(node("text", { x, y: y + 4, "text-anchor": anchor, class: "pale" }, spot.name));
+  const label = ({ name, s }, r) => {
+    const [x, y] = at(s[0], r), aside = (x - middle) / r * Math.sign(r - radius), side = Math.abs(aside) < 0.4 ? 0 : Math.sign(aside), wide = 7 * name.length;
+    return { name, side, end: x, x: x + side * wide / 2, y, wide, high: 12 };
   };
-  ring.place.monitors.forEach((spot, i) => {
-    const well = state.monitors[i].state === "ok", s = spot.s[0], [cx, cy] = at(s, radius * (spot.name.startsWith("y") ? 1.27 : 1.22));
-    const dot = node("circle", { class: well ? "usual hollow" : "faulty", cx, cy, r: well ? 2.5 : 5 });
-    dot.append(node("title", {}, `${spot.name}: ${state.monitors[i].state}`));
-    svg.append(dot);
-    if (!well) label(spot, s, radius * 1.36);
-  });
-  ring.place.correctors.forEach((spot, i) => {
-    const well = (state.correctors[i] ?? { state: "ok" }).state === "ok", s = spot.s[0], [x, y] = at(s, radius * 0.78), r = well ? 2.5 : 5;
-    const mark = node("path", { class: well ? "usual hollow" : "faulty", d: `M${x} ${y - r}L${x + r} ${y + r}L${x - r} ${y + r}Z` });
-    mark.append(node("title", {}, `${spot.name}: ${well ? "ok" : state.correctors[i].state}`));
-    svg.append(mark);
-    if (!well) label(spot, s, radius * 0.66);
-  });
-  const wrong = state.monitors.concat(state.correctors).filter((each) => each.state !== "ok").length;
-  svg.append(node("text", { x: middle, y: middle - 4, "text-anchor": "middle" }, `${ring.place.circumference.toFixed(1)} m`));
-  svg.append(node("text", { x: middle, y: middle + 14, "text-anchor": "middle", class: "pale" }, wrong ? `${wrong} not ok` : "all instruments ok"));
-  put("ring", svg);
+  const centre = { x: middle, y: middle, wide: 60, high: 40 };
+  const labels = (instruments, r) => instruments.filter((each) => !isOk(each)).map((each) => label(each, r * radius));
+  const ill = [...labels(state.monitors, 1.36), ...labels(state.correctors, 0.7 - 0.04 * circles)];
+  const names = clear([centre, ...ill]).slice(1).map(({ name, side, end, y }) => node("text", { x: end, y: y + 4, "text-anchor": ["end", "middle", "start"][side + 1], class: "pale" }, name));
+  fill($("ring"), [picture(size, size, "The ring", [
+    node("circle", { class: "axis", cx: middle, cy: middle, r: radius }),
+    ...bars, ...dots, ...triangles, ...names,
+    node("text", { x: middle, y: middle - 4, "text-anchor": "middle" }, `${ring.place.circumference.toFixed(1)} m`),
+    node("text", { x: middle, y: middle + 14, "text-anchor": "middle", class: "pale" }, ill.length ? `${ill.length} not ok` : "all instruments ok"),
+  ])]);
 }
 
-function residuals(state) {
-  const wide = width("residuals"), left = 40, right = 8, top = 8, high = 190, bottom = 44;
-  const shown = state.monitors.flatMap((each) => [each.noise_mm == null ? 0 : 2 * each.noise_mm, each.use === "used" ? Math.abs(each.residual_mm ?? 0) : 0]);
-  const reach = 1.1 * Math.max(0.01, ...shown), svg = picture(wide, top + high + bottom, "Readings less what the estimate expects");
-  const y = (mm) => top + high / 2 * (1 - Math.max(-1, Math.min(1, mm / reach)));
-  for (const tick of ticks(-reach, reach, 4)) {
-    svg.append(node("line", { class: tick === 0 ? "nominal" : "axis", x1: left, x2: wide - right, y1: y(tick), y2: y(tick) }));
-    svg.append(node("text", { class: "pale", x: left - 5, y: y(tick) + 4, "text-anchor": "end" }, tick));
-  }
-  svg.append(node("text", { class: "pale", x: 2, y: top + 4 }, "mm"));
-  const step = (wide - left - right) / state.monitors.length;
-  state.monitors.forEach((each, i) => {
-    const x = left + (i + 0.5) * step, name = ring.place.monitors[i].name;
-    const group = node("g");
-    group.append(node("title", {}, `${name}: ${each.residual_mm == null ? each.use : `${each.residual_mm.toFixed(3)} mm, ${each.use}`}, noise ${each.noise_mm?.toFixed(3)} mm, ${each.state}`));
-    if (each.noise_mm != null) group.append(node("rect", { class: "band", x: x - step / 2, width: step, y: y(2 * each.noise_mm), height: y(-2 * each.noise_mm) - y(2 * each.noise_mm) }));
-    if (each.residual_mm != null) {
-      const [from, to] = [Math.min(y(0), y(each.residual_mm)), Math.max(y(0), y(each.residual_mm))];
-      const look = each.state === "ok" ? "usual" : "faulty";
-      group.append(node("rect", { class: each.use === "used" ? look : `${look} hollow`, x: x - 0.3 * step, width: 0.6 * step, y: from, height: Math.max(1, to - from) }));
-    }
-    group.append(node("text", { transform: `translate(${x + 4} ${top + high + 6}) rotate(-90)`, "text-anchor": "end", class: `${each.state === "ok" ? "pale" : "faulty"}${step < 11 ? " small" : ""}` }, name));
-    svg.append(group);
+// In as many rows as make each bar wide enough to point at. Where labels have no room, every second or fifth has one, and those not ok come first.
+function residuals(state, wide) {
+  const left = 40, right = 8, long = wide - left - right;
+  const rows = Math.ceil(3 * state.monitors.length / long), columns = Math.ceil(state.monitors.length / rows), step = long / columns;
+  const [top, high] = rows > 1 ? [20, 100] : [8, 190], bottom = Math.max(44, 7 * Math.max(...state.monitors.map(({ name }) => name.length)) + 10);
+  const shown = state.monitors.flatMap((each) => [2 * each.noise_mm, each.use === "used" ? Math.abs(each.residual_mm) : 0]);
+  const reach = 1.1 * Math.max(0.01, ...shown), down = (mm) => high / 2 * (1 - Math.max(-1, Math.min(1, mm / reach)));
+  const tops = Array.from({ length: rows }, (_, row) => top + row * (high + bottom));
+  const grid = tops.flatMap((top) => ticks(-reach, reach, 4).flatMap((tick) => [
+    node("line", { class: tick === 0 ? "nominal" : "axis", x1: left, x2: wide - right, y1: top + down(tick), y2: top + down(tick) }),
+    node("text", { class: "pale", x: left - 5, y: top + down(tick) + 4, "text-anchor": "end" }, tick),
+  ]));
+  const isTight = step >= 8 && step < 11, gap = isTight ? 8 : 11, every = [1, 2, 5].find((n) => n * step >= gap);
+  const spots = state.monitors.map((each, i) => ({ ...each, x: left + (i % columns + 0.5) * step, y: tops[Math.floor(i / columns)], wide: gap, high: 1 }));
+  const labelled = new Set(clear([...spots.filter((spot) => !isOk(spot)), ...spots.filter((_, i) => i % every === 0)]));
+  const bars = spots.map((spot) => {
+    const { name, use, noise_mm, residual_mm, x, y } = spot, look = isOk(spot) ? "usual" : "faulty";
+    const [from, to] = [Math.min(down(0), down(residual_mm)), Math.max(down(0), down(residual_mm))];
+    return node("g", {}, [
+      node("title", {}, `${name}: ${residual_mm === null ? use : `${residual_mm.toFixed(3)} mm, ${use}`}, noise ${fixed(noise_mm, 3)} mm, ${spot.state}`),
+      noise_mm !== null && node("rect", { class: "band", x: x - step / 2, width: step, y: y + down(2 * noise_mm), height: down(-2 * noise_mm) - down(2 * noise_mm) }),
+      residual_mm !== null && node("rect", { class: use === "used" ? look : `${look} hollow`, x: x - 0.3 * step, width: 0.6 * step, y: y + from, height: Math.max(1, to - from) }),
+      labelled.has(spot) && node("text", { transform: `translate(${x + 4} ${y + high + 6}) rotate(-90)`, "text-anchor": "end", class: `${isOk(spot) ? "pale" : "faulty"}${isTight ? " small" : ""}` }, name),
+    ]);
   });
-  put("residuals", svg);
+  fill($("residuals"), [picture(wide, top + rows * (high + bottom), "Readings less what the estimate expects", [...grid, node("text", { class: "pale", x: 2, y: 12 }, "mm"), ...bars])]);
 }
 
 const percent = (share) => `${Math.round(100 * share)} %`;
 function unwell(state) {
   const seen = {
-    noisy: (r) => `scatters ${r[0].toFixed(1)} times as much as expected`,
+    noisy: (r) => `scatters ${fixed(r[0], 1)} times as much as expected`,
     jumps: (r) => `${percent(r[1])} of its frames are far off`,
     dead: (r) => `missing, stuck or without effect in ${percent(r[2])} of its frames`,
     back: () => "its fault has ended a short while ago",
   };
-  const all = [...state.monitors.map((each, i) => [ring.place.monitors[i].name, each]), ...state.correctors.map((each, i) => [ring.place.correctors[i].name, each])];
-  const rows = all.filter(([, each]) => each.state !== "ok").map(([name, each]) => [name, each.state, each.ratios ? seen[each.state](each.ratios) : ""]);
-  $("healthy").textContent = `${state.monitors.filter((each) => each.state === "ok").length} of ${state.monitors.length} monitors and ${state.correctors.filter((each) => each.state === "ok").length} of ${state.correctors.length} correctors are ok.`;
+  const [monitors, correctors] = [state.monitors, state.correctors].map((all) => `${all.filter(isOk).length} of ${all.length}`);
+  const rows = [...state.monitors, ...state.correctors].filter((each) => !isOk(each)).map(({ name, state, ratios }) => [name, state, ratios ? seen[state](ratios) : ""]);
+  $("healthy").textContent = `${monitors} monitors and ${correctors} correctors are ok.`;
   $("unwell").hidden = rows.length === 0;
   table("unwell", rows);
 }
 
 function table(id, rows, bad = () => false) {
-  $(id).tBodies[0].replaceChildren(...rows.map((cells) => {
-    const row = document.createElement("tr");
-    row.className = bad(cells) ? "bad" : "";
-    row.append(...cells.map((text, i) => {
-      const cell = document.createElement("td");
-      [cell.textContent, cell.className] = [text, i > 0 && typeof text === "number" ? "number" : ""];
-      return cell;
-    }));
-    return row;
-  }));
+  const cell = (text, i) => node("td", { class: i > 0 && typeof text === "number" ? "number" : "" }, text);
+  fill($(id).tBodies[0], rows.map((cells) => node("tr", { class: bad(cells) ? "bad" : "" }, cells.map(cell))));
 }
 
 function faults(state) {
@@ -200,60 +214,97 @@ function faults(state) {
 }
 
 async function trail() {
-  const over = $("span").value, wide = width("trail"), left = 50, right = 10, top = 24, high = 180, bottom = 24;
-  const reply = await fetch(`/trail.json?span=${over}&var=${encodeURIComponent(chosen)}`);
-  const points = (await reply.json()).points.filter(([, mean]) => mean !== null);
-  const svg = picture(wide, top + high + bottom, `History of ${chosen}`);
+  const name = chosen, over = $("span").value, wide = width("trail"), left = 50, right = 10, top = 24, high = 180, bottom = 24;
+  const found = await reply(`/trail.json?span=${over}&var=${encodeURIComponent(name)}`).catch(() => null);
+  if (!found || name !== chosen || over !== $("span").value) return;
+  const points = found.points.map(([time, mean, sigma, , mismatch]) => ({ time, mean, sigma, mismatch })).filter(isKnown);
   const long = { hour: 36e5, day: 864e5, month: 2592e6 }[over], now = Date.now();
-  const first = points.length ? Math.min(points[0][0], now - long / 60) : now - long, from = Math.max(now - long, first);
-  const low = Math.min(1, ...points.map(([, mean, sigma]) => mean - 2 * sigma)), top_ = Math.max(1, ...points.map(([, mean, sigma]) => mean + 2 * sigma));
-  const pad = 0.05 * (top_ - low) || 0.01, x = (time) => left + (wide - left - right) * (time - from) / (now - from), y = (value) => top + high * (top_ + pad - value) / (top_ - low + 2 * pad);
-  for (const tick of ticks(low - pad, top_ + pad, 4)) {
-    svg.append(node("line", { class: tick === 1 ? "nominal" : "axis", x1: left, x2: wide - right, y1: y(tick), y2: y(tick) }));
-    svg.append(node("text", { class: "pale", x: left - 5, y: y(tick) + 4, "text-anchor": "end" }, tick));
-  }
+  const from = Math.max(now - long, points.length ? Math.min(points[0].time, now - long / 60) : 0);
+  const low = Math.min(1, ...points.map(({ mean, sigma }) => mean - 2 * sigma)), most = Math.max(1, ...points.map(({ mean, sigma }) => mean + 2 * sigma));
+  const pad = 0.05 * (most - low) || 0.01, x = (time) => left + (wide - left - right) * (time - from) / (now - from), y = (value) => top + high * (most + pad - value) / (most - low + 2 * pad);
+  const grid = ticks(low - pad, most + pad, 4).flatMap((tick) => [
+    node("line", { class: tick === 1 ? "nominal" : "axis", x1: left, x2: wide - right, y1: y(tick), y2: y(tick) }),
+    node("text", { class: "pale", x: left - 5, y: y(tick) + 4, "text-anchor": "end" }, tick),
+  ]);
   const clock = new Intl.DateTimeFormat("en-GB", over === "month" ? { day: "numeric", month: "short" } : { hour: "2-digit", minute: "2-digit" });
-  for (let i = 0; i <= 4; i++) {
-    const time = from + (now - from) * i / 4;
-    svg.append(node("text", { class: "pale", x: x(time), y: top + high + 16, "text-anchor": i === 0 ? "start" : i === 4 ? "end" : "middle" }, clock.format(time)));
-  }
-  const line = (value) => points.map((point, i) => `${i ? "L" : "M"}${x(point[0]).toFixed(1)} ${y(value(point)).toFixed(1)}`).join("");
-  if (points.length) {
-    const back = [...points].reverse().map((point) => `L${x(point[0]).toFixed(1)} ${y(point[1] - 2 * point[2]).toFixed(1)}`).join("");
-    svg.append(node("path", { class: "area", d: `${line((point) => point[1] + 2 * point[2])}${back}Z` }), node("path", { class: "curve", d: line((point) => point[1]) }));
-    points.filter((point) => point[4]).forEach((point) => svg.append(node("line", { class: "faulty", x1: x(point[0]), x2: x(point[0]), y1: top + high - 6, y2: top + high })));
-    const [, mean, sigma] = points[points.length - 1];
-    svg.append(node("circle", { class: "weak", cx: x(points[points.length - 1][0]), cy: y(mean), r: 3 }));
-    svg.append(node("text", { x: left, y: 12 }, `${chosen}: ${mean.toFixed(4)} ± ${sigma.toFixed(4)}; the band is two error bars`));
-  } else svg.append(node("text", { x: left, y: 12, class: "pale" }, "no estimates in this time"));
-  put("trail", svg);
+  const times = [0, 1, 2, 3, 4].map((i) => from + (now - from) * i / 4);
+  const hours = times.map((time, i) => node("text", { class: "pale", x: x(time), y: top + high + 16, "text-anchor": i === 0 ? "start" : i === 4 ? "end" : "middle" }, clock.format(time)));
+  const line = (points, value) => points.map((point) => `${x(point.time).toFixed(1)} ${y(value(point)).toFixed(1)}`).join("L");
+  const newest = points.at(-1);
+  const curve = newest ? [
+    node("path", { class: "area", d: `M${line(points, ({ mean, sigma }) => mean + 2 * sigma)}L${line([...points].reverse(), ({ mean, sigma }) => mean - 2 * sigma)}Z` }),
+    node("path", { class: "curve", d: `M${line(points, ({ mean }) => mean)}` }),
+    ...points.filter(({ mismatch }) => mismatch).map(({ time }) => node("line", { class: "faulty", x1: x(time), x2: x(time), y1: top + high - 6, y2: top + high })),
+    node("circle", { class: "weak", cx: x(newest.time), cy: y(newest.mean), r: 3 }),
+    node("text", { x: left, y: 12 }, `${inWords({ name, ...newest })}; the band is two error bars`),
+  ] : [node("text", { x: left, y: 12, class: "pale" }, "no estimates in this time")];
+  fill($("trail"), [picture(wide, top + high + bottom, `History of ${name}`, [...grid, ...hours, ...curve])]);
+}
+
+function choose(name) {
+  chosen = $("var").value = name;
+  draw();
+  trail();
+}
+
+function draw() {
+  // asked before anything changes, widths cost no layout of their own
+  const widths = ["vars", "ring", "residuals"].map(width);
+  verdict(last ?? {});
+  if (!last) return;
+  numbers(last);
+  faults(last);
+  if (!last.vars) return;
+  [vars, map, residuals].forEach((picture, i) => picture(last, widths[i]));
+  unwell(last);
+}
+
+const reply = async (path) => (await fetch(path, { signal: AbortSignal.timeout(3000) })).json();
+
+async function begin() {
+  ring = await reply("/ring.json");
+  $("machine").textContent = document.title = ring.place.machine;
+  $("publisher").textContent = `published by ${ring.publisher}`;
+  chosen = ring.place.vars[0]?.name;
+  $("var").replaceChildren(...ring.place.vars.map(({ name }) => new Option(name)));
+}
+
+// The numbers, each with its name and place.
+function named(state) {
+  if (!state.vars) return state;
+  const instruments = (kind) => ring.place[kind].map((spot, i) => ({ ...spot, state: "ok", ...state[kind][i] }));
+  const vars = ring.place.vars.map((spot, i) => ({ ...spot, mean: state.vars[i][0], sigma: state.vars[i][1] }));
+  return { ...state, vars, monitors: instruments("monitors"), correctors: instruments("correctors") };
+}
+
+// From one question to the next [ms]: soon after the next estimate where ten come a second, rarely where none comes.
+function pause() {
+  if (failed || document.hidden || last.shown_s_ago === undefined) return 1000;
+  const age = 1000 * last.shown_s_ago;
+  return Math.min(1000, Math.max(120 - age, age / 3));
 }
 
 async function look() {
+  const asked = performance.now();
   try {
-    if (!ring) {
-      ring = await (await fetch("/ring.json")).json();
-      $("machine").textContent = document.title = ring.place.machine;
-      $("publisher").textContent = `published by ${ring.publisher}`;
-      chosen = ring.place.vars[0]?.name;
-      $("var").replaceChildren(...ring.place.vars.map((spot) => new Option(spot.name)));
-    }
-    last = await (await fetch("/state.json")).json();
+    if (!ring) await begin();
+    last = named(await reply("/state.json"));
     failed = 0;
   } catch {
     failed += 1;
   }
-  if (last) {
-    verdict(last);
-    numbers(last);
-    faults(last);
-    if (last.vars) [vars, map, residuals, unwell].forEach((draw) => draw(last));
-  } else if (failed) verdict({});
+  setTimeout(look, asked + pause() - performance.now());
+  draw();
 }
 
-$("var").addEventListener("change", () => { chosen = $("var").value; if (last?.vars) vars(last); trail(); });
+for (const event of ["click", "keydown"]) {
+  $("vars").addEventListener(event, ({ target, key = "Enter" }) => {
+    const link = target.closest("a");
+    if (link && key === "Enter") choose(link.dataset.var);
+  });
+}
+$("var").addEventListener("change", () => choose($("var").value));
 $("span").addEventListener("change", trail);
-addEventListener("resize", () => { if (last?.vars) look().then(trail); });
+addEventListener("resize", () => { draw(); trail(); });
 look().then(trail);
-setInterval(look, 1000);
-setInterval(() => trail().catch(() => {}), 10_000);
+setInterval(trail, 10_000);
