@@ -16,8 +16,8 @@ use crate::checkpoint::{self, Checkpoint, CheckpointError, Head, Model};
 use crate::source::desk::Wish;
 use crate::source::queue::{Arrived, Queue};
 
-/// What the posterior expects of readings is worked out as often as this.
-const FITTED: Duration = Duration::from_millis(90);
+/// What the posterior expects of readings is worked out, for the page, no more often than this: of ten frames a second, each.
+const FITTED: Duration = Duration::from_millis(50);
 
 /// Readings are compared with the model as often as this, by the time of frames [us]: that takes as long as several frames while vars do
 /// not walk.

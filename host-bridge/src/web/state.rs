@@ -84,9 +84,9 @@ fn ratios(condition: &Condition) -> [Value; 3] {
     condition.ratios.map(finite)
 }
 
-/// JSON has no infinite numbers.
+/// To six decimals, a nanometre or a millionth of a var; JSON has no infinite numbers.
 fn finite(number: f32) -> Value {
-    if number.is_finite() { json!(number) } else { Value::Null }
+    if number.is_finite() { json!((1e6 * f64::from(number)).round() / 1e6) } else { Value::Null }
 }
 
 /// A value of a query without its percent signs.

@@ -43,7 +43,7 @@ fn with_page(test: &str, run: impl FnOnce(u16, &Place, u32)) {
         listening(&mut subscriber, 1);
     };
     (1..=300).for_each(&mut feed);
-    // not every frame is in a picture, of which five are made a second
+    // not every frame is in a picture, of which twenty at most are made a second
     let start = Instant::now();
     let is_shown = |sequence: &u32| {
         assert!(start.elapsed() < SOON, "{}", get(page, "/state.json"));
