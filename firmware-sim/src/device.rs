@@ -165,7 +165,7 @@ impl<'m, E: Core, S: Steering<E>, const L: usize> Device<'m, E, S, L> {
     fn send_covariance(&self, number: u32, sequence: u32, reply: &mut impl FnMut(u32, &Reply<E>)) {
         let params = self.built_in.layout().params();
         let mut places = (0..params).flat_map(|i| (0..=i).map(move |j| (i, j)));
-        for first in (0..(params * (params + 1) / 2) as u16).step_by(PIECE) {
+        for first in (0..(params * (params + 1) / 2) as u32).step_by(PIECE) {
             let entries = listed(places.by_ref().take(PIECE).map(|(i, j)| self.core.covariance(i, j)));
             reply(number, &link::Reply::Covariance { sequence, first, entries });
         }

@@ -27,32 +27,8 @@ const NOISE: f64 = 0.005;
 /// If there are more further monitors than cells.
 pub fn file(cells: usize, further: usize) -> Value {
     assert!(further <= cells, "a cell has two monitors at most");
-    let angle = core::f64::consts::PI / cells as f64;
-    let bend = json!({"type": "sbend", "length": 2.0, "angle": angle, "e1": 0.5 * angle, "e2": 0.5 * angle});
-    let quadrupole = |family: &str| json!({"type": "quadrupole", "length": 0.4, "family": family});
-    let corrector = |plane: &str| json!({"type": "corrector", "length": 0.0, "plane": plane});
-    let monitor = |plane: &str| json!({"type": "bpm", "length": 0.0, "plane": plane});
-    let mut elements = Vec::new();
-    for cell in 0..cells {
-        let mut add = |name: &str, half: char, at: f64, of_kind: &Value| {
-            let mut element = of_kind.clone();
-            element["name"] = json!(format!("{name}_{cell:03}{half}"));
-            element["s_start"] = json!(CELL * cell as f64 + at);
-            elements.push(element);
-        };
-        add("CH", 'F', 0.3, &corrector("H"));
-        add("BX", 'F', 0.5, &monitor("H"));
-        add("BY", 'F', 0.5, &monitor("V"));
-        add("QF", 'F', 0.6, &quadrupole("QF"));
-        add("B", 'F', 1.5, &bend);
-        add("CV", 'D', 4.3, &corrector("V"));
-        if cell < further {
-            add("BX", 'D', 4.5, &monitor("H"));
-            add("BY", 'D', 4.5, &monitor("V"));
-        }
-        add("QD", 'D', 4.6, &quadrupole("QD"));
-        add("B", 'D', 5.5, &bend);
-    }
+    let cell = |number: usize| cell(number, core::f64::consts::PI / cells as f64, number < further);
+    let elements: Vec<Value> = (0..cells).flat_map(cell).collect();
     json!({
         "name": format!("{cells} cells"),
         "circumference_m": CELL * cells as f64,
@@ -60,6 +36,34 @@ pub fn file(cells: usize, further: usize) -> Value {
         "reference": {"particle": "electron", "kinetic_energy_GeV": 6.0},
         "data": {"prior_width": WIDTH},
         "elements": elements,
+    })
+}
+
+/// The elements of one cell, whose dipoles bend by some angle each.
+fn cell(number: usize, angle: f64, has_both_monitors: bool) -> impl Iterator<Item = Value> {
+    let bend = json!({"type": "sbend", "length": 2.0, "angle": angle, "e1": 0.5 * angle, "e2": 0.5 * angle});
+    let quadrupole = |family: &str| json!({"type": "quadrupole", "length": 0.4, "family": family});
+    let corrector = |plane: &str| json!({"type": "corrector", "length": 0.0, "plane": plane});
+    let monitor = |plane: &str| json!({"type": "bpm", "length": 0.0, "plane": plane});
+    let elements = [
+        ("CH", "F", 0.3, corrector("H")),
+        ("BX", "F", 0.5, monitor("H")),
+        ("BY", "F", 0.5, monitor("V")),
+        ("QF", "F", 0.6, quadrupole("QF")),
+        ("B", "F", 1.5, bend.clone()),
+        ("CV", "D", 4.3, corrector("V")),
+        ("BX", "D", 4.5, monitor("H")),
+        ("BY", "D", 4.5, monitor("V")),
+        ("QD", "D", 4.6, quadrupole("QD")),
+        ("B", "D", 5.5, bend),
+    ];
+    let is_there = move |(name, half, ..): &(&str, &str, f64, Value)| {
+        has_both_monitors || *half == "F" || !["BX", "BY"].contains(name)
+    };
+    elements.into_iter().filter(is_there).map(move |(name, half, at, mut element)| {
+        element["name"] = json!(format!("{name}_{number:03}{half}"));
+        element["s_start"] = json!(CELL * number as f64 + at);
+        element
     })
 }
 

@@ -1,14 +1,14 @@
 //! The orbit of misaligned quadrupoles follows the ripple of their supplies, and adds to the dispersion: exact closed orbits through
 //! the core.
 
-use estimator::Surrogate;
 use estimator::booster::PARAMS;
+use estimator::surrogate::Prediction;
+use estimator::{Drive, Layout, Surrogate};
 use inference::Recording;
 use inference::simulate::{self, Hardware, Truth};
 use inference::stream::{self, Core, Walk};
 use system_tests::machine::nees;
 use system_tests::{cells, repository};
-use training::rooms::large;
 use twin::Ring;
 
 /// The core after a simulated campaign, its best params, and the true ones.
@@ -91,24 +91,26 @@ fn chi_square_is_its_degrees_of_freedom() {
     assert!((mean - 1.0).abs() < 3.0 * 0.0137 / 10.0_f64.sqrt(), "{mean}");
 }
 
-/// A surrogate in the large room.
-trait Large: Surrogate<{ large::MONITORS }, { large::CORRECTORS }, { large::SUPPLIES }, { large::PARAMS }> {}
-impl Large for large::Green {}
-
 /// Rms change of orbits per `ln` of each supply's factor over their rms, in x and y: of a sample of the instruments, and of kicks by every corrector at every
 /// monitor.
-fn followed<G: Large>(tables: &G) -> [[[f64; 2]; 2]; 2] {
-    let (mut drive, mut prediction) = (large::Drive::NONE, Box::new(large::Prediction::BLANK));
+fn followed<const B: usize, const C: usize, const F: usize, const N: usize, G: Surrogate<B, C, F, N>>(
+    tables: &G,
+) -> [[[f64; 2]; 2]; 2] {
+    let (mut drive, mut prediction) = (Drive::NONE, Box::new(Prediction::BLANK));
     let mut at = Box::new(G::UNLINEARISED);
-    tables.linearise(&[0.0; large::PARAMS], &[0.0; large::SUPPLIES], &mut at).unwrap();
-    let sizes = tables.layout().ring;
+    tables.linearise(&[0.0; N], &[0.0; F], &mut at).unwrap();
+    let Layout { ring, room } = tables.layout();
+    let slots = |own: [u16; 2], room: [u16; 2], plane: usize| {
+        let first = if plane == 0 { 0 } else { usize::from(room[0]) };
+        first..first + usize::from(own[plane])
+    };
     let by_all = [0, 1].map(|plane| {
         let (mut changes, mut size) = ([0.0; 2], 0.0);
-        for c in (0..usize::from(sizes.correctors[plane])).map(|c| plane * large::CORRECTORS_BY_PLANE[0] + c) {
+        for c in slots(ring.correctors, room.correctors, plane) {
             drive.kick[c] = 1e-3;
             tables.predict(&at, &drive, &mut prediction);
             drive.kick[c] = 0.0;
-            for b in (0..usize::from(sizes.monitors[plane])).map(|b| plane * large::MONITORS_BY_PLANE[0] + b) {
+            for b in slots(ring.monitors, room.monitors, plane) {
                 size += f64::from(prediction.reading[b]).powi(2);
                 let each = changes.iter_mut().zip(&prediction.by_supply[b]);
                 each.for_each(|(change, slope)| *change += f64::from(*slope).powi(2));
@@ -125,14 +127,19 @@ fn followed<G: Large>(tables: &G) -> [[[f64; 2]; 2]; 2] {
 
 /// Where a plane has more than 64 monitors or correctors a sample of them is taken: off by 1.3 % at most here.
 #[test]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
 fn a_sample_of_instruments_tells_how_orbits_follow_the_supplies() {
     training::with_stack(|| {
-        for (number, further) in [(64, 64), (80, 40), (100, 20), (127, 0)] {
-            let mut tables = Box::new(large::Green::BLANK);
-            training::green::tables(&cells::ring(number, further)).unwrap().fill(&mut *tables).unwrap();
-            let [by_sample, by_all] = followed(&*tables);
+        for (number, further) in [(64, 64), (80, 40), (100, 20), (127, 0), (256, 64)] {
+            let tables = training::green::tables(&cells::ring(number, further)).unwrap();
+            let [by_sample, by_all] = training::in_spare_room!(tables.sizes(), |room| {
+                let mut own = Box::new(room::Green::BLANK);
+                tables.fill(&mut *own).unwrap();
+                followed::<{ room::MONITORS }, { room::CORRECTORS }, { room::SUPPLIES }, { room::PARAMS }, _>(&*own)
+            })
+            .unwrap();
             for (sample, all) in by_sample.as_flattened().iter().zip(by_all.as_flattened()) {
-                assert!((sample / all - 1.0).abs() < 0.03, "{number} cells: {sample} by a sample, {all} by all");
+                assert!((sample / all - 1.0).abs() < 0.014, "{number} cells: {sample} by a sample, {all} by all");
             }
         }
     });

@@ -31,7 +31,7 @@ pub mod wide {
     estimator::machine!(monitors: [128, 128], correctors: [128, 128], quadrupoles: 128, params: 128, supplies: 8);
 }
 
-/// Synchrotrons of some hundred quadrupoles.
+/// Synchrotrons of up to 256 quadrupoles.
 #[allow(missing_docs)] // those of `estimator::machine!`
 pub mod large {
     estimator::machine!(monitors: [128, 128], correctors: [128, 128], quadrupoles: 256, params: 256, supplies: 16);
@@ -97,8 +97,8 @@ macro_rules! in_spare_room {
     }};
 }
 
-/// Stack for the work in a room [B]: the largest core is put together on it, and linearised.
-const STACK: usize = 64 << 20;
+/// Stack for the work in a room [B]: the largest core is put together on it, copied and linearised. It is reserved, and taken as far as it is used.
+const STACK: usize = 4 * size_of::<largest::Estimator>();
 
 /// Do something on a thread whose stack is large enough for any room.
 ///

@@ -13,7 +13,7 @@ use crate::sobol::sobol;
 /// the shift.
 const MACHINES: u32 = 40;
 const SHIFT: f64 = 0.2e-3;
-/// Of their Sobol points.
+/// Seed of the Sobol points of their shifts.
 const SEED: u32 = 1;
 /// A ring of a small slip factor keeps its frequency with a large momentum, and may lose the orbit: its quadrupoles are shifted less, but not
 /// by less than this [m].

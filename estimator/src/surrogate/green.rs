@@ -637,8 +637,8 @@ fn tune_at(design: f32, determinant: f32) -> Result<f32, Unstable> {
 }
 
 impl<const B: usize, const C: usize, const M: usize, const Q: usize> PlaneLinearised<B, C, M, Q> {
-    /// Rms of `dR_bc/d(ln strength) = - sum over nodes of k L w strength Z_qb Z_qc` over all `b` and `c`, for the quadrupoles of
-    /// each supply and for all of them, over the rms of `R_bc`; of that many monitors and correctors, a [`sample`] of each.
+    /// Rms of `dR_bc/d(ln strength) = - sum over nodes of k L w strength Z_qb Z_qc` over a [`sample`] of the ring's monitors `b` and correctors `c`, for the
+    /// quadrupoles of each supply and for all of them, over the rms of `R_bc`.
     #[inline(never)]
     fn follow<const F: usize>(
         &self,
@@ -763,12 +763,12 @@ fn between<const Q: usize>(nodes: &Column<Q>, q: usize) -> f32 {
     nodes.codes.as_chunks::<2>().0.get(q).map_or(0.0, |codes| nodes.scale * mean(codes))
 }
 
-/// Monitors and correctors of a plane at most over which [`PlaneLinearised::follow`] takes its means: off by 1.3 % at most on rings of 80 to 127 cells
+/// Monitors and correctors of a plane at most over which [`PlaneLinearised::follow`] takes its means: off by 1.3 % at most on rings of 64 to 256 cells
 /// (`tests/tests/ripple.rs`).
 const SAMPLE: usize = 64;
 
-/// All of a number of instruments, or of more than [`SAMPLE`] as many, spread by the golden ratio, which falls in step with no cell
-/// or betatron phase.
+/// Indices of all of a number of instruments, or of [`SAMPLE`] where there are more: at multiples of the golden ratio, which falls in step with no cell and no
+/// betatron phase; of fewer than 127 some repeat.
 fn sample(number: usize) -> impl Iterator<Item = usize> {
     (0..number.min(SAMPLE)).map(move |i| {
         let turn = 0.618_034 * i as f32;

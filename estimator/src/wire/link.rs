@@ -25,7 +25,7 @@ pub const UNASKED: u32 = 0;
 /// Most entries of a covariance in one piece.
 pub const PIECE: usize = 56;
 /// Most bytes of the body of a request or reply whose size does not depend on the machine: a piece of a covariance.
-pub const OTHER_BYTES: usize = VARINT_32 + 1 + VARINT_32 + VARINT_16 + LENGTH + 4 * PIECE;
+pub const OTHER_BYTES: usize = VARINT_32 + 1 + VARINT_32 + VARINT_32 + LENGTH + 4 * PIECE;
 
 /// A request of a host: `S` is the setup of the device's core, `P` a parcel of its tables, `W` what is wanted of the orbit. On the wire
 /// its number comes first, which the reply repeats, so that a host never takes the reply to an earlier request for that to a later one.
@@ -72,7 +72,7 @@ pub enum Reply<A, U> {
         /// The frame after which it was taken.
         sequence: u32,
         /// Place of the first entry.
-        first: u16,
+        first: u32,
         /// The entries.
         entries: Vec<f32, PIECE>,
     },

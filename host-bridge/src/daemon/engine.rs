@@ -186,9 +186,11 @@ impl Engine {
         self.last.map_or(0, |[_, frames]| frames)
     }
 
-    /// The core's part of a checkpoint, if one is due.
+    /// The core's part of a checkpoint, if one is due: it waits until nothing is under way, which it would have to finish while frames wait, but no longer than
+    /// until the next one is due.
     pub(super) fn save_if_due(&mut self) -> Result<Option<Saved>, StateError> {
-        let is_due = self.saving.as_ref().is_some_and(|saving| saving.since >= saving.every);
+        let most = if self.is_prepared { 1 } else { 2 };
+        let is_due = self.saving.as_ref().is_some_and(|saving| saving.since >= most * saving.every);
         let Some(last) = self.last.filter(|_| is_due) else { return Ok(None) };
         self.saving.iter_mut().for_each(|saving| saving.since = 0);
         self.save(last).map(Some)

@@ -98,8 +98,8 @@ impl Coming {
     }
 
     /// Take a piece of a covariance, if it is the next one of this estimate's.
-    fn add(&mut self, sequence: u32, first: u16, entries: &[f32]) {
-        if sequence == self.estimate.sequence && usize::from(first) == self.covariance.len() {
+    fn add(&mut self, sequence: u32, first: u32, entries: &[f32]) {
+        if sequence == self.estimate.sequence && first as usize == self.covariance.len() {
             let room = triangle(&self.estimate) - self.covariance.len();
             self.covariance.extend(entries.iter().take(room));
         }

@@ -288,7 +288,10 @@ async function look() {
   const asked = performance.now();
   try {
     if (!ring) await begin();
-    last = named(await reply("/state.json"));
+    const state = await reply("/state.json");
+    // the daemon may have begun anew with another ring
+    if (state.vars && state.vars.length !== ring.place.vars.length) await begin();
+    last = named(state);
     failed = 0;
   } catch {
     failed += 1;

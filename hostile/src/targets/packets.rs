@@ -8,7 +8,7 @@ use crc::{CRC_32_ISO_HDLC, Crc};
 use estimator::booster::Frame;
 use estimator::wire::link::{REPLY, REQUEST, Reply, Vitals};
 use estimator::{Tables as _, Walk};
-use firmware_sim::machine::{BUILT_IN, Estimator, LINE, Steer, Tables};
+use firmware_sim::machine::{BUILT_IN, Estimator, LINE, PACKET, Steer, Tables};
 use firmware_sim::{Device, Event, Inbox};
 use inference::Recording;
 use inference::stream::{self, Core, Estimate};
@@ -137,7 +137,7 @@ fn device(bytes: &[u8]) -> bool {
     let (mut core, mut steer) = (Box::new(Estimator::BLANK), Box::new(Steer::BLANK));
     let mut slot = Box::new(Tables::BLANK);
     let mut device = Device::<_, _, LINE>::new(&mut *core, &mut *steer, &BUILT_IN, &mut *slot);
-    let (mut inbox, all) = (Inbox::<{ largest::PACKET }>::default(), [&setup, bytes, &WIRES[0], &WIRES[1]].concat());
+    let (mut inbox, all) = (Inbox::<{ PACKET }>::default(), [&setup, bytes, &WIRES[0], &WIRES[1]].concat());
     let mut source = all.as_slice();
     loop {
         match inbox.next(&mut source).expect("memory does not fail") {

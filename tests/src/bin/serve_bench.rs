@@ -35,7 +35,7 @@ struct Options {
     /// Frames come as those of this recording
     #[arg(long, default_value = "recordings/paper-vars")]
     recording: String,
-    /// Time at 10 kHz [s]
+    /// Time at 10 kHz, and at 10 Hz [s]
     #[arg(long, default_value_t = 60)]
     seconds: u32,
 }
@@ -104,9 +104,10 @@ fn measure(options: &Options, campaign: &Campaign, hertz: u32, seconds: u32) -> 
         &config,
         format!(
             "[machine]\n{}[source]\naddress = \"tcp://127.0.0.1:{port}\"\nrole = \"listen\"\n\
-             buffer_frames = {buffer_frames}\n[publish]\nservice = {service:?}\n[checkpoint]\nfile = \"checkpoint\"\n\
+             buffer_frames = {buffer_frames}\n[publish]\nservice = {service:?}\n[checkpoint]\nfile = \"checkpoint\"\ncheckpoint_every_frames = {}\n\
              [page]\naddress = \"127.0.0.1:{page}\"\n",
-            campaign.keys()
+            campaign.keys(),
+            20 * hertz
         ),
     )?;
     let frames = wires(campaign, hertz, hertz * seconds)?;
