@@ -2,7 +2,8 @@
 //! that it may wait for, and what was done until the next one. `cargo bench -p system-tests --bench rooms -- CELLS ..`; a table of docs/large-rings.md.
 
 use core::error::Error;
-use std::time::{Duration, Instant};
+use core::time::Duration;
+use std::time::Instant;
 
 use estimator::Prepared;
 use host_bridge::source::Times;

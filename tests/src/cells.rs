@@ -1,6 +1,6 @@
 //! Rings of cells of any size, and campaigns of them.
 
-use std::fmt::Write as _;
+use core::fmt::Write as _;
 use std::path::Path;
 
 use inference::Recording;
