@@ -263,11 +263,16 @@ impl Family {
         best.1.exp()
     }
 
+    /// What distances from the mean have in common.
+    pub fn further_mean(&self, values: &DVector<f64>) -> f64 {
+        let weighted = self.members.iter().zip(&self.weights).map(|(&i, weight)| weight * values[i]);
+        self.shared() * weighted.sum::<f64>()
+    }
+
     /// Deviations from the mean by the posterior of all unknowns.
     pub fn deviations(&self, values: &DVector<f64>, covariance: &DMatrix<f64>) -> Deviations {
-        let shared = self.shared();
+        let (shared, mean) = (self.shared(), self.further_mean(values));
         let weighted = || self.members.iter().copied().zip(&self.weights);
-        let mean = shared * weighted().map(|(i, weight)| weight * values[i]).sum::<f64>();
         let with_others: Vec<f64> =
             self.members.iter().map(|&i| weighted().map(|(j, weight)| weight * covariance[(i, j)]).sum()).collect();
         let of_mean =

@@ -269,10 +269,7 @@ impl Hierarchy {
     /// What a distance from the mean of a family is told in shares of: gains and strengths of the mean of their family, couplings of the mean gain in the other
     /// plane, which the orbits that they see or make are of, since monitors and kicks of a plane have a common scale that no matrix tells; 1 of anything else.
     pub fn scale_of(&self, unknown: usize) -> f64 {
-        let mean = |unknown: usize| {
-            let Unknown { mean, width, .. } = self.unknowns[unknown];
-            mean + self.family_of(unknown).map_or(0.0, |family| family.mean) * width
-        };
+        let mean = |unknown: usize| self.unknowns[unknown].mean + self.in_common(unknown);
         let other_plane = |gain: &str| {
             let class = &self.classes[unknown];
             let of_gain = |&number: &usize| self.unknowns[number].kind.word() == gain && self.classes[number] != *class;
@@ -310,8 +307,14 @@ impl Hierarchy {
 
     /// Distance of a value from the mean of the family that it is of, whether it is released or not.
     pub fn off_family(&self, unknown: usize) -> f64 {
-        let Unknown { mean, width, .. } = self.unknowns[unknown];
-        self.values[unknown] - mean - self.family_of(unknown).map_or(0.0, |family| family.mean) * width
+        self.values[unknown] - self.unknowns[unknown].mean - self.in_common(unknown)
+    }
+
+    /// What the members of an unknown's family have in common beyond their means beforehand. What the family expects is ahead of the values where nothing tells it, as
+    /// the common scale of gains and kicks: it is told anew by the values.
+    fn in_common(&self, unknown: usize) -> f64 {
+        let Some(family) = self.family_of(unknown) else { return 0.0 };
+        (family.mean + family.further_mean(&self.off_means())) * self.unknowns[unknown].width
     }
 
     /// Standard deviation of that distance: what all members have in common is in both.

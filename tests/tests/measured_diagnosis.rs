@@ -85,7 +85,7 @@ fn what_remains_at_sps_is_of_its_instruments() {
 #[ignore = "make measured"]
 fn families_predict_the_larger_rings() {
     families_predict("spear3_example", 17_000.0, 1.4);
-    families_predict("pls_2009", 42_000.0, 0.95);
+    families_predict("pls_2009", 15_000.0, 0.95);
     families_predict("als_2005_topoff", 7_000.0, 1.8);
 }
 
@@ -151,8 +151,8 @@ fn what_one_half_of_the_correctors_names_the_other_names() {
     let mean = pulls.iter().map(|pull| pull * pull).sum::<f64>() / pulls.len().max(1) as f64;
     println!("{again} of {count} again, mean square pull {mean:.2} of {}", pulls.len());
     assert!(again as f64 >= 0.9 * count as f64, "{again} of {count}");
-    // 8.35 is measured, of couplings at PLS, which one half says are 3 to 7 % larger than the other does: not understood
-    assert!(mean < 9.0, "mean square pull {mean}");
+    // 1.15 is measured, of eight couplings at PLS, each told both ways; their mean square is above 1.6 once in eight times
+    assert!(mean < 1.6, "mean square pull {mean}");
 }
 
 /// Where nothing was changed between two measurements, both name the same places, the wigglers that were closed.
@@ -171,7 +171,7 @@ fn what_one_measurement_names_the_next_one_names() {
     let mean = pulls.iter().map(|pull| pull * pull).sum::<f64>() / pulls.len() as f64;
     println!("{again} of {count} again, mean square pull {mean:.2} of {}", pulls.len());
     assert!(count > 0 && again as f64 >= 0.9 * f64::from(count as u32), "{again} of {count}");
-    // 0.34 is measured, of five differences, each told both ways; their mean square is above 1.6 once in six times
+    // 0.33 is measured, of five differences, each told both ways; their mean square is above 1.6 once in six times
     assert!(mean < 1.6, "mean square pull {mean}");
 }
 
