@@ -263,15 +263,15 @@ impl Family {
         best.1.exp()
     }
 
-    /// What distances from the mean have in common.
-    pub fn further_mean(&self, values: &DVector<f64>) -> f64 {
-        let weighted = self.members.iter().zip(&self.weights).map(|(&i, weight)| weight * values[i]);
+    /// What the distances of the members from the mean have in common.
+    pub fn further_mean(&self, distance: impl Fn(usize) -> f64) -> f64 {
+        let weighted = self.members.iter().zip(&self.weights).map(|(&i, weight)| weight * distance(i));
         self.shared() * weighted.sum::<f64>()
     }
 
     /// Deviations from the mean by the posterior of all unknowns.
     pub fn deviations(&self, values: &DVector<f64>, covariance: &DMatrix<f64>) -> Deviations {
-        let (shared, mean) = (self.shared(), self.further_mean(values));
+        let (shared, mean) = (self.shared(), self.further_mean(|i| values[i]));
         let weighted = || self.members.iter().copied().zip(&self.weights);
         let with_others: Vec<f64> =
             self.members.iter().map(|&i| weighted().map(|(j, weight)| weight * covariance[(i, j)]).sum()).collect();

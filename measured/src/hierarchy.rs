@@ -255,9 +255,13 @@ impl Hierarchy {
     /// Distance of the values from the means of their families, in widths.
     pub fn off_means(&self) -> DVector<f64> {
         let means = means(&self.families, self.unknowns.len());
-        DVector::from_fn(means.len(), |i, _| {
-            (self.values[i] - self.unknowns[i].mean) / self.unknowns[i].width - means[i]
-        })
+        DVector::from_fn(means.len(), |i, _| self.off_prior(i) - means[i])
+    }
+
+    /// Distance of a value from what was expected beforehand, in widths.
+    fn off_prior(&self, unknown: usize) -> f64 {
+        let Unknown { mean, width, .. } = self.unknowns[unknown];
+        (self.values[unknown] - mean) / width
     }
 
     /// The family that an unknown is of, whether it is released or not.
@@ -314,7 +318,8 @@ impl Hierarchy {
     /// the common scale of gains and kicks: it is told anew by the values.
     fn in_common(&self, unknown: usize) -> f64 {
         let Some(family) = self.family_of(unknown) else { return 0.0 };
-        (family.mean + family.further_mean(&self.off_means())) * self.unknowns[unknown].width
+        let further = family.further_mean(|member| self.off_prior(member) - family.mean);
+        (family.mean + further) * self.unknowns[unknown].width
     }
 
     /// Standard deviation of that distance: what all members have in common is in both.

@@ -3,7 +3,7 @@
 
 use estimator::booster::PARAMS;
 use estimator::surrogate::Prediction;
-use estimator::{Drive, Layout, Surrogate};
+use estimator::{Drive, Surrogate};
 use inference::Recording;
 use inference::simulate::{self, Hardware, Truth};
 use inference::stream::{self, Core, Walk};
@@ -99,18 +99,18 @@ fn followed<const B: usize, const C: usize, const F: usize, const N: usize, G: S
     let (mut drive, mut prediction) = (Drive::NONE, Box::new(Prediction::BLANK));
     let mut at = Box::new(G::UNLINEARISED);
     tables.linearise(&[0.0; N], &[0.0; F], &mut at).unwrap();
-    let Layout { ring, room } = tables.layout();
-    let slots = |own: [u16; 2], room: [u16; 2], plane: usize| {
-        let first = if plane == 0 { 0 } else { usize::from(room[0]) };
-        first..first + usize::from(own[plane])
+    let layout = tables.layout();
+    let in_plane = |[x, y]: [u16; 2], plane: usize| {
+        let (x, y) = (usize::from(x), usize::from(y));
+        if plane == 0 { 0..x } else { x..x + y }
     };
     let by_all = [0, 1].map(|plane| {
         let (mut changes, mut size) = ([0.0; 2], 0.0);
-        for c in slots(ring.correctors, room.correctors, plane) {
+        for c in in_plane(layout.ring.correctors, plane).map(|c| layout.corrector(c)) {
             drive.kick[c] = 1e-3;
             tables.predict(&at, &drive, &mut prediction);
             drive.kick[c] = 0.0;
-            for b in slots(ring.monitors, room.monitors, plane) {
+            for b in in_plane(layout.ring.monitors, plane).map(|b| layout.monitor(b)) {
                 size += f64::from(prediction.reading[b]).powi(2);
                 let each = changes.iter_mut().zip(&prediction.by_supply[b]);
                 each.for_each(|(change, slope)| *change += f64::from(*slope).powi(2));

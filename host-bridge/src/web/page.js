@@ -255,7 +255,7 @@ function draw() {
   numbers(last);
   faults(last);
   if (!last.vars) return;
-  [vars, map, residuals].forEach((picture, i) => picture(last, widths[i]));
+  [vars, map, residuals].forEach((show, i) => show(last, widths[i]));
   unwell(last);
 }
 

@@ -107,7 +107,7 @@ fn measure(options: &Options, campaign: &Campaign, hertz: u32, seconds: u32) -> 
              buffer_frames = {buffer_frames}\n[publish]\nservice = {service:?}\n[checkpoint]\nfile = \"checkpoint\"\ncheckpoint_every_frames = {}\n\
              [page]\naddress = \"127.0.0.1:{page}\"\n",
             campaign.keys(),
-            20 * hertz
+            (20 * hertz).min(1000)
         ),
     )?;
     let frames = wires(campaign, hertz, hertz * seconds)?;
