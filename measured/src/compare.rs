@@ -168,7 +168,8 @@ pub fn compare(
 fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
     let mut all = Vec::new();
     let is_field = |family: &&Family| matches!(family.kind, "stray_gradient" | "skew_gradient") && family.is_learnt();
-    for family in changed.families.iter().filter(is_field) {
+    let is_wider = |family: &&Family| family.scale > family.ordinary;
+    for family in changed.families.iter().filter(is_field).filter(is_wider) {
         let marginal = changed.posterior.marginal(family)?;
         let ordinary = family.with_scale(family.ordinary);
         // errors that are alike along rows and columns tell less than independent ones
