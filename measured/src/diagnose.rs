@@ -16,7 +16,7 @@ use crate::hierarchy::Hierarchy;
 use crate::hold::Share;
 use crate::model::Model;
 use crate::normal::Places;
-use crate::search::{NAMED, Outlier, Rival, Search, search, straights};
+use crate::search::{NAMED, Outlier, Rival, Search, search};
 use crate::straight::DEAD;
 use crate::unknowns::{Groups, Kind, name};
 use crate::wiring::Wiring;
@@ -194,15 +194,12 @@ impl Diagnosis {
         let hierarchy = Hierarchy::of_fit(folder, fitted, settings, progress)?;
         let model = Model::of(folder, &hierarchy.groups, settings.rf)?;
         let (mut hierarchy, found) = released(hierarchy, folder, &model, fitted.has_ended, progress)?;
-        let is_new = |straight: &Outlier| !found.unknowns().contains(&straight.unknown);
-        let straights: Vec<Outlier> = straights(&hierarchy).into_iter().filter(is_new).collect();
         progress("elements held out");
         let held_out = [as_loco(folder, fitted, settings)?, with_families(&hierarchy, fitted)?];
         // parts of the matrix that tell a value differently bear out no smaller error
         hierarchy.uncertainty.sigma.zip_apply(&held_out[1].jackknife, |sigma, scatter| *sigma = sigma.max(scatter));
         let cables = cables.iter().map(|cable| Finding::of_cable(folder, &hierarchy, cable));
-        let members =
-            found.outliers.iter().chain(&straights).map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
+        let members = found.outliers.iter().map(|outlier| Finding::of_outlier(folder, &hierarchy, outlier));
         let mut findings: Vec<Finding> = cables.chain(Finding::of_share(&share)).chain(members).collect();
         // what the whole ring does before what stands at a place
         let is_local = |finding: &Finding| !matches!(finding.what, What::Hold(_));
@@ -360,7 +357,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             word: family.kind,
             class: family.class.clone(),
             count: family.members.len(),
-            mean: family.mean * width,
+            mean: hierarchy.common(family) * width,
             scatter: family.variance().sqrt() * width,
             ordinary: family.ordinary_scatter() * width,
             sigma: sigma[sigma.len() / 2],
@@ -409,7 +406,7 @@ fn with_families(hierarchy: &Hierarchy, fitted: &Fit) -> Result<HeldOut, Measure
     let width =
         DVector::from_iterator(hierarchy.unknowns.len(), hierarchy.unknowns.iter().map(|unknown| unknown.width));
     let precision = hierarchy.precision();
-    let pull = &precision * hierarchy.off_means();
+    let pull = &precision * hierarchy.off_priors();
     let fit = Fitted {
         places: &places,
         prediction: &hierarchy.prediction,

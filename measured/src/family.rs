@@ -1,16 +1,16 @@
 //! Families of unknowns: members of one kind and class have a common mean, and scatter about it by a scale that the measurement tells.
 //!
-//! In units of the prior's width a member is `x_i = m + e + d_i`, `m` the mean as it is known, `e ~ N(0, f^2)` what it may be off and `d_i ~ N(0, s^2/w_i)`,
-//! `s` at most 1. With `e` integrated out the prior's precision of the `n` members about `m` is
+//! In units of the prior's width a member is `x_i = e + d_i` from what is expected beforehand, `e ~ N(0, f^2)` what all have in common and `d_i ~ N(0, s^2/w_i)`,
+//! `s` at most 1. With `e` integrated out the prior's precision of the `n` members is
 //!
 //! `(W - c w w^T)/s^2`, `c = 1/(sum w + s^2/f^2)`.
 //!
 //! The weights `w_i = (nu + 1)/(nu + d_i^2/s^2)` make a family one of Student's distribution: what one member has is not spread over those that
 //! look like it, and does not widen the family.
 //!
-//! The mean follows from one linearisation to the next, `m` by the posterior of `e`: gains of all monitors and kicks of all correctors together tell nothing, and
-//! what is linear holds for small steps only. Vertical focusing that all straights have is of the dipoles' edges beside them. Gradients and skew gradients that the
-//! lattice does not have are about 0.
+//! Two kinds have something in common: kicks, by the constant that amperes are converted with, and vertical focusing of straights, by the edges of the dipoles beside
+//! them. A matrix tells no common scale of monitors and kicks of a plane: gains of monitors are about 1, and the scale is of the kicks. With a scale for either their
+//! scatters would tell it, which are smaller for smaller gains. Gradients and skew gradients that the lattice does not have are about 0.
 //!
 //! The scale is the one of largest evidence. With `P` the prior's precision, `b x - x G x/2` the `ln` likelihood of the members where everything else adapts, and `k`
 //! members of an ordinary ring whose scale is `s_0`, that is the maximum of
@@ -51,8 +51,8 @@ pub const BEFOREHAND: f64 = 2.0;
 const TAILS: f64 = 4.0;
 /// Variance of normal members over the square of the scale that this distribution gives them, the `r` of `E (nu + 1) r x^2/(nu + r x^2) = 1`.
 const NORMAL: f64 = 1.48;
-/// What a mean may be off about one linearisation, in widths of the prior.
-const FREEDOM: f64 = 0.1;
+/// What all members may be off together, in widths of the prior.
+const FREEDOM: f64 = 1.0;
 
 /// Unknowns of one kind and class.
 #[derive(Debug, Clone, PartialEq)]
@@ -63,15 +63,13 @@ pub struct Family {
     pub class: String,
     /// Members, by their number among the unknowns.
     pub members: Vec<usize>,
-    /// Mean of the members in widths of the prior, from what is expected.
-    pub mean: f64,
     /// Scatter of the members in widths of the prior.
     pub scale: f64,
     /// The same of what is ordinary.
     pub ordinary: f64,
     /// Weight of each member.
     pub weights: Vec<f64>,
-    /// What the mean may be off about one linearisation, in widths of the prior; 0 where the members are about what is expected.
+    /// What all may be off together, in widths of the prior; 0 where the members are about what is expected.
     pub freedom: f64,
 }
 
@@ -90,9 +88,9 @@ pub fn families(
     let (large, small): (Vec<_>, Vec<_>) = members.into_iter().partition(|(_, members)| members.len() >= ENOUGH);
     let large = large.into_iter().map(|((kind, class), members)| {
         let weights = vec![1.0; members.len()];
-        let has_mean = kind.contains("gain") || kind == Kind::Wiggler(0).word();
+        let has_mean = kind == Kind::CorrectorGain(0).word() || kind == Kind::Wiggler(0).word();
         let freedom = if has_mean { FREEDOM } else { 0.0 };
-        Family { kind, class, members, mean: 0.0, scale: ordinary, ordinary, weights, freedom }
+        Family { kind, class, members, scale: ordinary, ordinary, weights, freedom }
     });
     let alone = |number: usize, scale: f64| {
         let kind = unknowns[number].kind.word();
@@ -100,7 +98,6 @@ pub fn families(
             kind,
             class: String::new(),
             members: vec![number],
-            mean: 0.0,
             scale,
             ordinary: scale,
             weights: vec![1.0],
@@ -147,14 +144,12 @@ pub fn sort(folder: &Folder, row: usize) -> &'static str {
     }
 }
 
-/// Deviations of a family's members from their mean, with their variances, in widths of the prior.
+/// Deviations of a family's members from what they have in common, with their variances, in widths of the prior.
 pub struct Deviations {
     /// `d_i`.
     pub value: Vec<f64>,
     /// Their posterior variance.
     pub variance: Vec<f64>,
-    /// What the mean is off.
-    pub mean: f64,
 }
 
 /// What the data say of the members of a family, everything else adapting: `ln` likelihood `b x - x G x/2`.
@@ -171,6 +166,11 @@ impl Family {
         !self.class.is_empty()
     }
 
+    /// True where the scale is that of the members. Most straights have no wiggler, and a wiggler is no scatter of the others.
+    pub fn has_own_scale(&self) -> bool {
+        self.is_learnt() && self.kind != Kind::Wiggler(0).word()
+    }
+
     /// True where unknowns of a kind and class are its members, unless they are released.
     pub fn claims(&self, kind: &str, class: &str) -> bool {
         self.kind == kind && self.class == class
@@ -181,7 +181,7 @@ impl Family {
         Self { weights: vec![1.0; self.members.len()], ..self.clone() }
     }
 
-    /// True where the members are about a mean of their own.
+    /// True where the members are about a value of their own.
     pub fn has_mean(&self) -> bool {
         self.freedom > 0.0
     }
@@ -194,15 +194,6 @@ impl Family {
     /// Standard deviation of the members of an ordinary ring in widths of the prior.
     pub fn ordinary_scatter(&self) -> f64 {
         NORMAL.sqrt() * self.ordinary
-    }
-
-    /// Begin with the mean of some values.
-    pub fn mean_from(&mut self, unknowns: &[Unknown], values: &DVector<f64>) {
-        if self.has_mean() {
-            let off =
-                self.members.iter().map(|&member| (values[member] - unknowns[member].mean) / unknowns[member].width);
-            self.mean = off.sum::<f64>() / self.members.len() as f64;
-        }
     }
 
     /// `c` of the precision, 0 without a mean.
@@ -263,15 +254,21 @@ impl Family {
         best.1.exp()
     }
 
-    /// What the distances of the members from the mean have in common.
-    pub fn further_mean(&self, distance: impl Fn(usize) -> f64) -> f64 {
+    /// Mean of the members' values.
+    pub fn mean(&self, values: &DVector<f64>) -> f64 {
+        let weighted = self.members.iter().zip(&self.weights).map(|(&member, weight)| weight * values[member]);
+        weighted.sum::<f64>() / self.weights.iter().sum::<f64>()
+    }
+
+    /// What distances of the members have in common.
+    pub fn common(&self, distance: impl Fn(usize) -> f64) -> f64 {
         let weighted = self.members.iter().zip(&self.weights).map(|(&i, weight)| weight * distance(i));
         self.shared() * weighted.sum::<f64>()
     }
 
-    /// Deviations from the mean by the posterior of all unknowns.
+    /// Deviations from what they have in common by the posterior of all unknowns.
     pub fn deviations(&self, values: &DVector<f64>, covariance: &DMatrix<f64>) -> Deviations {
-        let (shared, mean) = (self.shared(), self.further_mean(|i| values[i]));
+        let (shared, common) = (self.shared(), self.common(|i| values[i]));
         let weighted = || self.members.iter().copied().zip(&self.weights);
         let with_others: Vec<f64> =
             self.members.iter().map(|&i| weighted().map(|(j, weight)| weight * covariance[(i, j)]).sum()).collect();
@@ -280,9 +277,8 @@ impl Family {
                 + self.scale * self.scale * shared;
         let variance = self.members.iter().zip(&with_others);
         Deviations {
-            value: self.members.iter().map(|&i| values[i] - mean).collect(),
+            value: self.members.iter().map(|&i| values[i] - common).collect(),
             variance: variance.map(|(&i, others)| covariance[(i, i)] - 2.0 * shared * others + of_mean).collect(),
-            mean,
         }
     }
 
@@ -305,7 +301,7 @@ mod tests {
     fn family(kind: &'static str, count: usize, scale: f64) -> Family {
         let weights = (0..count).map(|member| 1.0 / (1.0 + member as f64)).collect();
         let (class, members, freedom) = ("x".into(), (0..count).collect(), 0.0);
-        Family { kind, class, members, mean: 0.0, scale, ordinary: ORDINARY, weights, freedom }
+        Family { kind, class, members, scale, ordinary: ORDINARY, weights, freedom }
     }
 
     #[test]
@@ -357,7 +353,7 @@ mod tests {
     fn a_common_value_is_the_mean_and_no_scatter() {
         let family = Family { weights: vec![1.0; 400], freedom: FREEDOM, ..family("bpm_gain", 400, 0.1) };
         let found = family.deviations(&DVector::from_element(400, 0.05), &DMatrix::zeros(400, 400));
-        // the mean is drawn to what it was by (s/f)^2 of 400
-        assert!((found.mean - 0.05).abs() < 0.05 / 400.0 && found.value.iter().all(|one| one.abs() < 2e-4));
+        // what is in common is drawn to 0 by (s/f)^2 of 400
+        assert!(found.value.iter().all(|one| one.abs() < 0.05 * 0.01 / 400.0 * 1.01));
     }
 }

@@ -22,8 +22,8 @@ use crate::normal::{Places, times};
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
 
-/// Linearisations: the first begins at the fit, whose values differ from the last ones by what families take.
-const ROUNDS: usize = 7;
+/// Linearisations at most: the first begins at the fit, whose values differ from the last ones by what families take.
+const ROUNDS: usize = 10;
 /// Times that each family has its turn, at most.
 const MOST_TURNS: usize = 40;
 /// What is not linear may look like a family with this share of the gain of the first, until all is linearised anew.
@@ -32,7 +32,7 @@ const NONLINEAR: f64 = 0.1;
 const SETTLED: f64 = 30.0;
 /// Gain of a scale that is worth a turn [nat].
 const ENOUGH: f64 = 2.0;
-/// Damping of the first step: gains of all monitors and kicks of all correctors together tell nothing, and go nowhere.
+/// Damping of the first step, beside which what nothing tells goes nowhere.
 const DAMPING: f64 = 1e-6;
 /// Damping at which no step helps.
 const STUCK: f64 = 1e6;
@@ -69,9 +69,9 @@ pub struct Hierarchy {
 pub struct Posterior {
     /// Curvature of `-ln` likelihood.
     pub information: DMatrix<f64>,
-    /// Its slope where all unknowns are at the means of their families.
+    /// Its slope where all unknowns are as expected beforehand.
     pub slope: DVector<f64>,
-    /// Distance of the values from the means of their families.
+    /// Distance of the values from that.
     pub values: DVector<f64>,
     /// Covariance.
     pub covariance: DMatrix<f64>,
@@ -113,7 +113,7 @@ impl Posterior {
     fn learn_scales(&mut self, families: &mut [Family], share: f64) -> Result<f64, MeasuredError> {
         let (mut least, mut gained) = (ENOUGH, 0.0);
         let mut turns: Vec<Turn> = (0..families.len())
-            .filter(|&number| families[number].is_learnt())
+            .filter(|&number| families[number].has_own_scale())
             .map(|number| Turn { number, gain: f64::INFINITY, scale: 0.0, is_told: false })
             .collect();
         for _ in 0..MOST_TURNS * turns.len() {
@@ -187,10 +187,7 @@ impl Hierarchy {
             known.map_or(unknown.mean, |number| fitted.values[number])
         });
         let values = DVector::from_iterator(unknowns.len(), start);
-        let mut families = families(folder, &groups, &unknowns, &[], ORDINARY);
-        for family in &mut families {
-            family.mean_from(&unknowns, &values);
-        }
+        let families = families(folder, &groups, &unknowns, &[], ORDINARY);
         let model = Model::of(folder, &groups, settings.rf)?;
         let classes = unknowns.iter().map(|unknown| class(folder, &groups, unknown.kind)).collect();
         let data = Data::with_coupling(folder, &fitted.outliers);
@@ -219,7 +216,7 @@ impl Hierarchy {
         for family in &mut families {
             let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
             let Some(known) = known else { continue };
-            (family.mean, family.scale, family.freedom) = (known.mean, known.scale, known.freedom);
+            (family.scale, family.freedom) = (known.scale, known.freedom);
         }
         let Self { data, groups, unknowns, values, classes, noise, .. } = self;
         let start = Start { data, groups, unknowns, values, classes, families, noise };
@@ -243,6 +240,8 @@ impl Hierarchy {
         let wigglers = families.iter_mut().filter(|family| family.kind == Kind::Wiggler(0).word());
         wigglers.for_each(|family| family.freedom = 0.0);
         let Self { groups, values, classes, noise, .. } = self.clone();
+        // with tails a row whose gain changed by a quarter would look like errors, and weigh little
+        let noise = noise.without_tails();
         let start = Start { data, groups, unknowns, values, classes, families, noise };
         start.settle(model, ROUNDS, progress)
     }
@@ -252,13 +251,11 @@ impl Hierarchy {
         precision(&self.families, self.unknowns.len())
     }
 
-    /// Distance of the values from the means of their families, in widths.
-    pub fn off_means(&self) -> DVector<f64> {
-        let means = means(&self.families, self.unknowns.len());
-        DVector::from_fn(means.len(), |i, _| self.off_prior(i) - means[i])
+    /// Distances of the values from what was expected beforehand, in widths.
+    pub fn off_priors(&self) -> DVector<f64> {
+        DVector::from_fn(self.values.len(), |i, _| self.off_prior(i))
     }
 
-    /// Distance of a value from what was expected beforehand, in widths.
     fn off_prior(&self, unknown: usize) -> f64 {
         let Unknown { mean, width, .. } = self.unknowns[unknown];
         (self.values[unknown] - mean) / width
@@ -270,19 +267,19 @@ impl Hierarchy {
         self.families.iter().find(|family| family.is_learnt() && family.claims(kind, class))
     }
 
-    /// What a distance from the mean of a family is told in shares of: gains and strengths of the mean of their family, couplings of the mean gain in the other
-    /// plane, which the orbits that they see or make are of, since monitors and kicks of a plane have a common scale that no matrix tells; 1 of anything else.
+    /// What a distance from the mean of a family is told in shares of: gains and strengths of the mean of their family, couplings of the mean gain in the other plane,
+    /// whose orbits they see or make; 1 of anything else.
     pub fn scale_of(&self, unknown: usize) -> f64 {
-        let mean = |unknown: usize| self.unknowns[unknown].mean + self.in_common(unknown);
-        let other_plane = |gain: &str| {
-            let class = &self.classes[unknown];
-            let of_gain = |&number: &usize| self.unknowns[number].kind.word() == gain && self.classes[number] != *class;
-            (0..self.unknowns.len()).find(of_gain).map_or(1.0, mean)
+        let in_other_plane = |gain: &str| {
+            let is_it = |one: &&Family| one.is_learnt() && one.kind == gain && one.class != self.classes[unknown];
+            self.families.iter().find(is_it).map_or(1.0, |gains| gains.mean(&self.values))
         };
         match self.unknowns[unknown].kind {
-            Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::Strength(_) => mean(unknown),
-            Kind::MonitorCoupling(_) => other_plane("bpm_gain"),
-            Kind::CorrectorCoupling(_) => other_plane("corrector_gain"),
+            Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::Strength(_) => {
+                self.unknowns[unknown].mean + self.in_common(unknown)
+            }
+            Kind::MonitorCoupling(_) => in_other_plane(Kind::MonitorGain(0).word()),
+            Kind::CorrectorCoupling(_) => in_other_plane(Kind::CorrectorGain(0).word()),
             _ => 1.0,
         }
     }
@@ -314,12 +311,14 @@ impl Hierarchy {
         self.values[unknown] - self.unknowns[unknown].mean - self.in_common(unknown)
     }
 
-    /// What the members of an unknown's family have in common beyond their means beforehand. What the family expects is ahead of the values where nothing tells it, as
-    /// the common scale of gains and kicks: it is told anew by the values.
+    /// What the members of an unknown's family have in common beyond their means beforehand.
     fn in_common(&self, unknown: usize) -> f64 {
-        let Some(family) = self.family_of(unknown) else { return 0.0 };
-        let further = family.further_mean(|member| self.off_prior(member) - family.mean);
-        (family.mean + further) * self.unknowns[unknown].width
+        self.family_of(unknown).map_or(0.0, |family| self.common(family)) * self.unknowns[unknown].width
+    }
+
+    /// The same of a family, in widths.
+    pub fn common(&self, family: &Family) -> f64 {
+        family.common(|member| self.off_prior(member))
     }
 
     /// Standard deviation of that distance: what all members have in common is in both.
@@ -351,9 +350,7 @@ struct Linearised {
     weight: DMatrix<f64>,
     information: DMatrix<f64>,
     slope: DVector<f64>,
-    /// What the means of the families expect.
-    expected: DVector<f64>,
-    /// Distance of the values from it.
+    /// Distance of the values from what is expected beforehand.
     off: DVector<f64>,
 }
 
@@ -378,17 +375,14 @@ impl Start {
         let places = Places::of(&self.unknowns, rows, columns);
         let scene = Scene { model, places, width: each(|one| one.width), mean: each(|one| one.mean) };
         let mut prediction = model.predict(&self.unknowns, &self.values)?;
-        let (mut damping, mut followed, mut curvature) = (DAMPING, DMatrix::zeros(0, 0), None);
+        let (mut damping, mut followed) = (DAMPING, DMatrix::zeros(0, 0));
         for round in 1..=rounds {
             progress(&format!("families, round {round} of {rounds}"));
-            let here = self.linearise(&scene, &prediction, None);
+            let here = self.linearise(&scene, &prediction);
             let share = if round < rounds { NONLINEAR } else { 0.0 };
             let (posterior, gained) = here.posterior(&self.families)?.learn(&mut self.families, share)?;
             let promised;
             (prediction, promised) = self.descend(&scene, &here, prediction, &mut damping)?;
-            for family in &mut self.families {
-                family.mean += family.deviations(&posterior.values, &posterior.covariance).mean;
-            }
             let left = self.data.residual(&prediction);
             // what the unknowns follow of an element changes with the families' scales, and little with the size of the errors
             if round == 1 || gained > 0.0 {
@@ -397,12 +391,10 @@ impl Start {
             }
             (self.noise, _) = self.noise.learnt(&self.data, &left, &followed);
             if gained + promised < SETTLED {
-                // the first round has the errors of another fit; later neither they nor so small a step change the curvature by much
-                curvature = (round > 1).then_some(here.information);
                 break;
             }
         }
-        let here = self.linearise(&scene, &prediction, curvature);
+        let here = self.linearise(&scene, &prediction);
         let (posterior, _) = here.posterior(&self.families)?.learn(&mut self.families, 0.0)?;
         let covariance = times(posterior.covariance.clone(), &scene.width);
         let information = times(posterior.information.clone(), &scene.width.map(f64::recip));
@@ -425,21 +417,17 @@ impl Start {
         })
     }
 
-    /// About a prediction, with a curvature that is known or is made.
-    fn linearise(&self, scene: &Scene, prediction: &Prediction, curvature: Option<DMatrix<f64>>) -> Linearised {
-        let n = self.unknowns.len();
+    /// About a prediction.
+    fn linearise(&self, scene: &Scene, prediction: &Prediction) -> Linearised {
         let residual = self.data.residual(prediction);
         let weight = self.data.weight(&self.noise, &residual);
         let slope = scene.places.back(prediction, &weight.component_mul(&residual));
-        let expected = &scene.mean + means(&self.families, n).component_mul(&scene.width);
         Linearised {
-            information: curvature
-                .unwrap_or_else(|| times(scene.places.information(prediction, &weight), &scene.width)),
+            information: times(scene.places.information(prediction, &weight), &scene.width),
             slope: slope.component_mul(&scene.width),
-            off: (&self.values - &expected).component_div(&scene.width),
+            off: (&self.values - &scene.mean).component_div(&scene.width),
             residual,
             weight,
-            expected,
         }
     }
 
@@ -454,7 +442,7 @@ impl Start {
         let prior = precision(&self.families, self.unknowns.len());
         let distance = |values: &DVector<f64>, prediction: &Prediction| {
             let left = self.data.residual(prediction);
-            let off = (values - &here.expected).component_div(&scene.width);
+            let off = (values - &scene.mean).component_div(&scene.width);
             left.component_mul(&left).dot(&here.weight) + off.dot(&(&prior * &off))
         };
         let now = distance(&self.values, &prediction);
@@ -484,13 +472,6 @@ impl Linearised {
         let slope = &self.slope + &self.information * &self.off;
         Posterior::of_families(self.information.clone(), slope, families)
     }
-}
-
-/// Mean of each unknown's family in widths.
-fn means(families: &[Family], unknowns: usize) -> DVector<f64> {
-    let mut means = DVector::zeros(unknowns);
-    families.iter().for_each(|family| family.members.iter().for_each(|&member| means[member] = family.mean));
-    means
 }
 
 /// Precision of the families' priors in widths.
@@ -586,25 +567,24 @@ mod tests {
         let mean = nees / f64::from(strengths);
         assert!((0.4..1.5).contains(&mean), "NEES {mean}");
     }
-
-    /// The curvature is that of the last round, where nothing moved by much any more: its diagonal is off by 6.5 % at most, half of that in error bars, and by 0.8 % on
-    /// average.
+    /// Readings that are all a fifth larger are of the constant that kicks are told with, and of nothing else.
     #[test]
-    fn the_curvature_is_that_at_the_values() {
-        let ring = ring();
-        let settings = Settings::default();
-        let (mut most, mut mean) = (0.0_f64, 0.0);
-        for seed in 0..4 {
-            let folder = measured(&ring, &machine(&ring, seed), NOISE, 700 + seed);
+    fn a_wrong_kick_constant_is_of_the_kicks_alone() {
+        let (ring, settings) = (ring(), Settings::default());
+        let folder = measured(&ring, &machine(&ring, 3), NOISE, 703);
+        let mut larger = folder.clone();
+        larger.matrix *= 1.2;
+        larger.monitors.iter_mut().for_each(|monitor| monitor.sigma *= 1.2);
+        let [plain, larger] = [folder, larger].map(|folder| {
             let fitted = fit(&folder, &settings, &mut |_| ()).unwrap();
-            let found = Hierarchy::of_fit(&folder, &fitted, &settings, &mut |_| ()).unwrap();
-            let Hierarchy { data, unknowns, noise, residual, prediction, posterior, .. } = &found;
-            let places = Places::of(unknowns, residual.nrows(), residual.ncols());
-            let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
-            let exact = times(places.information(prediction, &data.weight(noise, residual)), &width);
-            let off = posterior.information.diagonal().component_div(&exact.diagonal()).add_scalar(-1.0);
-            (most, mean) = (most.max(off.amax()), mean + off.mean().abs() / 4.0);
+            Hierarchy::of_fit(&folder, &fitted, &settings, &mut |_| ()).unwrap()
+        });
+        for (number, unknown) in plain.unknowns.iter().enumerate() {
+            let of_kicks = matches!(unknown.kind, Kind::CorrectorGain(_) | Kind::CorrectorCoupling(_));
+            let expected = if of_kicks { 1.2 } else { 1.0 } * plain.values[number];
+            let off = (larger.values[number] - expected) / larger.uncertainty.sigma[number];
+            // both end where a round promises less than 30 nat of some thousand
+            assert!(off.abs() < 0.5, "{:?}: {off}", unknown.kind);
         }
-        assert!(most < 0.066 && mean < 0.008, "{most} {mean}");
     }
 }

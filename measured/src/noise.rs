@@ -44,6 +44,12 @@ impl Noise {
         Self { monitors: vec![1.0; self.monitors.len()], ..self.clone() }
     }
 
+    /// The same with normal errors.
+    pub fn without_tails(mut self) -> Self {
+        self.blocks.iter_mut().for_each(|block| block.freedom = f64::INFINITY);
+        self
+    }
+
     /// Share `h` of each element's error that unknowns of some covariance follow: its weight times the variance that their covariance gives it.
     ///
     /// Source: D. A. Belsley, E. Kuh and R. E. Welsch, Regression Diagnostics (1980), eq. 2.15.

@@ -22,7 +22,7 @@ use crate::error::MeasuredError;
 use crate::family::{BEFOREHAND, FREE, Family};
 use crate::hierarchy::{Hierarchy, Posterior};
 use crate::linear::product;
-use crate::unknowns::{Kind, Unknown};
+use crate::unknowns::Kind;
 
 /// Members that are released in one search at most.
 const MOST: usize = 64;
@@ -75,23 +75,6 @@ impl Outlier {
         self.gain = gain;
         self
     }
-}
-
-/// Straights that focus vertically, as those with a wiggler do. Most rings have no wiggler and others have several, which widen their family: a straight stands out
-/// of those of an ordinary ring.
-pub fn straights(hierarchy: &Hierarchy) -> Vec<Outlier> {
-    let is_straight = |number: &usize| matches!(hierarchy.unknowns[*number].kind, Kind::Wiggler(_));
-    let numbers: Vec<usize> = (0..hierarchy.unknowns.len()).filter(is_straight).collect();
-    let outlier = |&unknown: &usize| {
-        let Unknown { kind, width, .. } = hierarchy.unknowns[unknown];
-        let ordinary = hierarchy.family_of(unknown)?.ordinary_scatter().powi(2);
-        let error = (hierarchy.uncertainty.sigma[unknown] / width).powi(2);
-        let gain = log_bayes_factor(hierarchy.off_family(unknown) / width, error, ordinary, numbers.len());
-        let prior = (expected(kind) / numbers.len() as f64).ln();
-        let probability = 1.0 / (1.0 + (-gain - prior).exp());
-        Some(Outlier { unknown, gain, probability, prior, alternatives: Vec::new() })
-    };
-    numbers.iter().filter_map(outlier).filter(Outlier::stands_out).collect()
 }
 
 /// True of `ln` odds at which something is named beside nothing.
