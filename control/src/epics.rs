@@ -125,7 +125,9 @@ impl Epics {
 
 impl Drop for Epics {
     fn drop(&mut self) {
-        drop(self.requests.take()); // the end of its input is the end of the process
+        // the end of its input is the end of the process, and nobody listens to what it still says
+        drop(self.requests.take());
+        self.replies = sync_channel(0).1;
         let deadline = Instant::now() + END;
         while matches!(self.process.try_wait(), Ok(None)) && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(10));
