@@ -757,8 +757,8 @@ impl<
         let nis = self.posterior.solution.cost - before;
         let (sum, readings) = (self.nis.0 + nis, self.nis.1 + f64::from(screened.count()));
         let kept = readings.min(REMEMBERED);
-        self.nis = (sum * kept / readings.max(1.0), kept);
-        nis as f32
+        self.nis = (finite(sum * kept / readings.max(1.0)), kept);
+        finite(nis) as f32
     }
 
     /// Look for steps of single vars in what the frame has said, if vars may step.
@@ -832,7 +832,7 @@ impl<
             restarted: screened.restarted,
             tune_innovation: screened.tune,
             setting: judged.cell,
-            log_evidence: solution.log_evidence as f32,
+            log_evidence: finite(solution.log_evidence) as f32,
             linearised: judged.linearised,
             remarks,
             health: judged.health,
@@ -852,7 +852,8 @@ impl<
     fn centre(&self, i: usize) -> f32 {
         let clipped = self.posterior.solution.clipped.has(i);
         let origin = self.posterior.gaussian.origin().get(i).copied().unwrap_or(0.0);
-        let unbounded = (f64::from(origin) + self.posterior.solution.delta.get(i).copied().unwrap_or(0.0)) as f32;
+        let delta = self.posterior.solution.delta.get(i).copied().unwrap_or(0.0);
+        let unbounded = finite(f64::from(origin) + delta) as f32;
         if clipped { unbounded } else { self.posterior.solution.map_params.get(i).copied().unwrap_or(unbounded) }
     }
 
@@ -909,6 +910,12 @@ impl<
         let (off_origin, _) = gaussian.expected(channel, self.slope(b), &solution.delta);
         self.predicted.prediction.reading.get(b).copied().unwrap_or(0.0) + off_origin as f32
     }
+}
+
+/// A number as estimates have it: what a state of absurd numbers makes infinite is as large as can be told.
+fn finite(number: f64) -> f64 {
+    let [least, most] = [f32::MIN, f32::MAX].map(f64::from);
+    if number.is_nan() { most } else { number.clamp(least, most) }
 }
 
 /// All but the work between frames, which is finished or begun anew.

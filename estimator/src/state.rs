@@ -34,6 +34,8 @@ pub enum StateError {
         /// The number.
         got: u32,
     },
+    /// A number that is not finite, which no state has.
+    Infinite,
     /// Work between frames is under way: it is finished first.
     UnderWay,
 }
@@ -44,6 +46,7 @@ impl fmt::Display for StateError {
             Self::Truncated { bytes } => write!(f, "the state does not end within its {bytes} bytes"),
             Self::Long { left } => write!(f, "{left} bytes are left after the state"),
             Self::Value { what, got } => write!(f, "the state has {got} as {what}"),
+            Self::Infinite => write!(f, "the state has a number that is not finite"),
             Self::UnderWay => write!(f, "the state cannot be saved while the model is linearised anew"),
         }
     }
@@ -160,20 +163,26 @@ pub fn layout(state: &mut impl State) -> u32 {
 }
 
 macro_rules! number {
-    ($($number:ty),*) => {$(
+    ($is_one:path: $($number:ident),*) => {$(
         impl State for $number {
             #[inline]
             fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
                 let mut own = self.to_le_bytes();
                 bytes.pass(&mut own)?;
                 *self = Self::from_le_bytes(own);
-                Ok(())
+                if $is_one(*self) { Ok(()) } else { Err(StateError::Infinite) }
             }
         }
     )*};
 }
 
-number!(u8, u16, i16, u32, i32, u64, f32, f64);
+const fn any<T: Copy>(_: T) -> bool {
+    true
+}
+
+number!(any: u8, u16, i16, u32, i32, u64);
+number!(f32::is_finite: f32);
+number!(f64::is_finite: f64);
 
 impl State for usize {
     fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
@@ -366,6 +375,9 @@ mod tests {
         assert_eq!(load(&mut empty(), &bytes[..n]), Err(StateError::Value { what: "yes or no", got: 2 }));
         (bytes[0], bytes[1]) = (1, 4);
         assert_eq!(load(&mut empty(), &bytes[..n]), Err(StateError::Value { what: "the length of a list", got: 4 }));
+        let mut infinite = Some3 { last: Some((f32::INFINITY, 9)), ..full() };
+        assert_eq!(save(&mut infinite, &mut bytes), Err(StateError::Infinite));
+        assert_eq!(load(&mut empty(), &bytes[..n]), Err(StateError::Infinite));
     }
 
     #[test]
