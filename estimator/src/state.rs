@@ -34,8 +34,8 @@ pub enum StateError {
         /// The number.
         got: u32,
     },
-    /// A number that is not finite, which no state has.
-    Infinite,
+    /// A real number that is NaN, which no state has.
+    NotANumber,
     /// Work between frames is under way: it is finished first.
     UnderWay,
 }
@@ -46,7 +46,7 @@ impl fmt::Display for StateError {
             Self::Truncated { bytes } => write!(f, "the state does not end within its {bytes} bytes"),
             Self::Long { left } => write!(f, "{left} bytes are left after the state"),
             Self::Value { what, got } => write!(f, "the state has {got} as {what}"),
-            Self::Infinite => write!(f, "the state has a number that is not finite"),
+            Self::NotANumber => write!(f, "the state has NaN as a number"),
             Self::UnderWay => write!(f, "the state cannot be saved while the model is linearised anew"),
         }
     }
@@ -163,26 +163,26 @@ pub fn layout(state: &mut impl State) -> u32 {
 }
 
 macro_rules! number {
-    ($is_one:path: $($number:ident),*) => {$(
+    ($is_none:path: $($number:ident),*) => {$(
         impl State for $number {
             #[inline]
             fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
                 let mut own = self.to_le_bytes();
                 bytes.pass(&mut own)?;
                 *self = Self::from_le_bytes(own);
-                if $is_one(*self) { Ok(()) } else { Err(StateError::Infinite) }
+                if $is_none(*self) { Err(StateError::NotANumber) } else { Ok(()) }
             }
         }
     )*};
 }
 
-const fn any<T: Copy>(_: T) -> bool {
-    true
+const fn never<T: Copy>(_: T) -> bool {
+    false
 }
 
-number!(any: u8, u16, i16, u32, i32, u64);
-number!(f32::is_finite: f32);
-number!(f64::is_finite: f64);
+number!(never: u8, u16, i16, u32, i32, u64);
+number!(f32::is_nan: f32);
+number!(f64::is_nan: f64);
 
 impl State for usize {
     fn pass(&mut self, bytes: &mut impl Bytes) -> Result<(), StateError> {
@@ -375,9 +375,9 @@ mod tests {
         assert_eq!(load(&mut empty(), &bytes[..n]), Err(StateError::Value { what: "yes or no", got: 2 }));
         (bytes[0], bytes[1]) = (1, 4);
         assert_eq!(load(&mut empty(), &bytes[..n]), Err(StateError::Value { what: "the length of a list", got: 4 }));
-        let mut infinite = Some3 { last: Some((f32::INFINITY, 9)), ..full() };
-        assert_eq!(save(&mut infinite, &mut bytes), Err(StateError::Infinite));
-        assert_eq!(load(&mut empty(), &bytes[..n]), Err(StateError::Infinite));
+        let mut no_number = Some3 { last: Some((f32::NAN, 9)), ..full() };
+        assert_eq!(save(&mut no_number, &mut bytes), Err(StateError::NotANumber));
+        assert_eq!(load(&mut empty(), &bytes[..n]), Err(StateError::NotANumber));
     }
 
     #[test]
