@@ -4,6 +4,7 @@
 //! address only. The page fetches nothing from elsewhere.
 
 mod board;
+mod connection;
 mod metrics;
 mod place;
 mod server;

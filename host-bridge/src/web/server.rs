@@ -1,19 +1,23 @@
 //! The server of the page: it reads the board, whoever asks, and changes nothing.
 
-use core::fmt::Display;
 use core::net::SocketAddr;
+use core::sync::atomic::{AtomicUsize, Ordering};
+use core::time::Duration;
+use std::net::TcpListener;
 use std::sync::Arc;
 use std::thread;
 
-use tiny_http::{Header, Method, Request, Response, Server};
-
 use super::board::Board;
+use super::connection::{Reply, Request, converse};
 use super::state;
 
-/// Requests that are served side by side: one that takes its reply slowly does not hold up the others.
-const WORKERS: usize = 3;
+/// Connections at a time: further ones are ended at once.
+const CONNECTIONS: usize = 256;
 /// The page loads from its own server only, in no frame of another page.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; frame-ancestors 'none'";
+/// Of every reply.
+const HEADERS: &[(&str, &str)] =
+    &[("Content-Security-Policy", POLICY), ("X-Content-Type-Options", "nosniff"), ("Cache-Control", "no-store")];
 
 const PAGE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("page.css");
@@ -44,29 +48,46 @@ pub fn start(address: SocketAddr, board: &Arc<Board>) -> Result<SocketAddr, WebE
     if !address.ip().is_loopback() {
         return Err(WebError::Network(address));
     }
-    let wrong = |reason: &dyn Display| WebError::Listen { address, reason: reason.to_string() };
-    let server = Arc::new(Server::http(address).map_err(|error| wrong(&error))?);
-    for _ in 0..WORKERS {
-        let (server, board) = (server.clone(), board.clone());
-        let worker = move || {
-            while let Ok(request) = server.recv() {
-                // whoever asked may be gone
-                let _ = serve(request, &board);
-            }
-        };
-        thread::Builder::new().name("page".into()).spawn(worker).map_err(|error| wrong(&error))?;
-    }
-    server.server_addr().to_ip().ok_or_else(|| wrong(&"no address"))
+    let wrong = |reason: std::io::Error| WebError::Listen { address, reason: reason.to_string() };
+    let listener = TcpListener::bind(address).map_err(wrong)?;
+    let at = listener.local_addr().map_err(wrong)?;
+    let board = board.clone();
+    thread::Builder::new().name("page".into()).spawn(move || listen(&listener, &board)).map_err(wrong)?;
+    Ok(at)
 }
 
-fn serve(request: Request, board: &Board) -> std::io::Result<()> {
-    if !matches!(request.method(), Method::Get | Method::Head) {
-        return request.respond(Response::from_string("only GET: nothing can be changed here\n").with_status_code(405));
+fn listen(listener: &TcpListener, board: &Arc<Board>) {
+    let open = Arc::new(AtomicUsize::new(0));
+    for browser in listener.incoming() {
+        let Ok(browser) = browser else {
+            // no file is left for it
+            thread::sleep(Duration::from_millis(100));
+            continue;
+        };
+        if open.load(Ordering::Relaxed) >= CONNECTIONS {
+            continue;
+        }
+        let (board, own) = (board.clone(), open.clone());
+        own.fetch_add(1, Ordering::Relaxed);
+        let serve = move || {
+            // whoever asked may be gone
+            let _ = converse(browser, HEADERS, |request| reply(request, &board));
+            own.fetch_sub(1, Ordering::Relaxed);
+        };
+        if thread::Builder::new().name("page".into()).spawn(serve).is_err() {
+            open.fetch_sub(1, Ordering::Relaxed);
+        }
     }
-    if !is_for_us(&request) {
-        return request.respond(Response::from_string("another host was asked\n").with_status_code(421));
+}
+
+fn reply(request: &Request, board: &Board) -> Reply {
+    if !matches!(request.method.as_str(), "GET" | "HEAD") {
+        return Reply::refusal("405 Method Not Allowed", "only GET: nothing can be changed here");
     }
-    let (path, query) = request.url().split_once('?').unwrap_or((request.url(), ""));
+    if !request.host.as_deref().is_none_or(is_of_this_machine) {
+        return Reply::refusal("421 Misdirected Request", "another host was asked");
+    }
+    let (path, query) = request.target.split_once('?').unwrap_or((&request.target, ""));
     let (kind, body) = match path {
         "/" => ("text/html; charset=utf-8", PAGE.to_owned()),
         "/page.css" => ("text/css; charset=utf-8", STYLE.to_owned()),
@@ -75,28 +96,16 @@ fn serve(request: Request, board: &Board) -> std::io::Result<()> {
         "/state.json" => ("application/json", state::now(board)),
         "/trail.json" => match state::trail(board, query) {
             Some(body) => ("application/json", body),
-            None => return request.respond(Response::from_string("no such span or var\n").with_status_code(404)),
+            None => return Reply::refusal("404 Not Found", "no such span or var"),
         },
         "/metrics" => ("application/openmetrics-text; version=1.0.0; charset=utf-8", board.metrics.text(&board.queue)),
-        _ => return request.respond(Response::from_string("not found\n").with_status_code(404)),
+        _ => return Reply::refusal("404 Not Found", "not found"),
     };
-    let headers = [
-        ("Content-Type", kind),
-        ("Content-Security-Policy", POLICY),
-        ("X-Content-Type-Options", "nosniff"),
-        ("Cache-Control", "no-store"),
-    ];
-    let response = Response::from_string(body);
-    let header = |(name, value): (&str, &str)| Header::from_bytes(name, value).expect("both are ASCII");
-    request.respond(headers.into_iter().fold(response, |response, pair| response.with_header(header(pair))))
+    Reply { status: "200 OK", kind, body }
 }
 
-/// True if this machine was asked: a page from elsewhere, whose name was made to point here, is not served.
-fn is_for_us(request: &Request) -> bool {
-    let host = request.headers().iter().find(|header| header.field.equiv("Host"));
-    host.is_none_or(|host| {
-        let host = host.value.as_str();
-        let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
-        name == "localhost" || name.trim_matches(['[', ']']).parse().is_ok_and(|ip: core::net::IpAddr| ip.is_loopback())
-    })
+/// True of a name of this machine: a page from elsewhere, whose name was made to point here, is not served.
+fn is_of_this_machine(host: &str) -> bool {
+    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
+    name == "localhost" || name.trim_matches(['[', ']']).parse().is_ok_and(|ip: core::net::IpAddr| ip.is_loopback())
 }
