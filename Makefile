@@ -64,7 +64,7 @@ loops: ## many closed loops in pairs of runs, estimated response against the des
 drift: ## a stream that drifts, and how soon steps of vars are found: docs/drift.md with its figure; minutes
 	cargo run --locked --release -p system-tests --bin drift
 
-serve-bench: build ## the daemon from a TCP source on loopback to a subscriber: lost and late at 10 kHz for a minute, latency at 1 kHz, both of a ring of 512 quadrupoles at 10 Hz
+serve-bench: build ## the daemon from a TCP source on loopback to a subscriber: lost and late at 10 kHz for a minute, latency at 1 kHz, also under attack, both of a ring of 512 quadrupoles at 10 Hz
 	cargo run --locked --release -p system-tests --bin serve_bench
 
 serve-kill: toolchain ## kill -9 of the daemon and of a reader, 100 times at random moments: restarts, leaks, frames lost; a minute

@@ -1,5 +1,6 @@
 //! What the system tests share: where the repository's files lie, and the truth behind its recordings.
 
+pub mod attackers;
 pub mod cells;
 pub mod drift;
 pub mod endurance;

@@ -1,11 +1,12 @@
 //! `make serve-bench`: how fast the daemon is, from a TCP source on loopback to a subscriber of the shared memory: frames lost and late at
-//! 10 kHz, latency at 1 kHz, and both of a ring that nearly fills the largest core at 10 Hz. Numbers of the machine at hand; no test asserts them.
+//! 10 kHz, latency at 1 kHz, the same under attack by senders and browsers, and both of a ring that nearly fills the largest core at 10 Hz. Numbers of the machine at
+//! hand; no test asserts them.
 //!
 //! The latency begins before the writer's call of the system. What of it is the daemon's, the daemon says itself, of the last 1,024 frames: from
 //! the frame in its queue until its readers are woken. From the stamp of the estimate until it is read is told by the reader.
 
 use core::error::Error;
-use core::sync::atomic::{AtomicU64, Ordering};
+use core::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use core::time::Duration;
 use std::fs;
 use std::io::{Read, Write};
@@ -18,7 +19,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use clap::Parser;
 use inference::{Recording, simulate, stream};
 use shared_memory::{Published, Subscriber};
-use system_tests::cells;
+use system_tests::{attackers, cells};
 use twin::{LatticeError, Ring};
 
 /// Frames that are later than this are counted as late.
@@ -35,7 +36,7 @@ struct Options {
     /// Frames come as those of this recording
     #[arg(long, default_value = "recordings/paper-vars")]
     recording: String,
-    /// Time at 10 kHz, and at 10 Hz [s]
+    /// Time at 10 kHz, under attack, and at 10 Hz [s]
     #[arg(long, default_value_t = 60)]
     seconds: u32,
 }
@@ -45,11 +46,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("other work: load {}", fs::read_to_string("/proc/loadavg")?.trim());
     println!("{:>6} {:>8} {:>8} {:>8}  latency [us]: median, 99 %, 99.9 %, largest", "Hz", "frames", "lost", "late");
     let booster = Campaign { machine: None, recording: fs::canonicalize(&options.recording)? };
-    for (hertz, seconds) in [(10_000, options.seconds), (1_000, 20)] {
-        println!("{}", measure(&options, &booster, hertz, seconds)?);
+    for (hertz, seconds, attacked) in
+        [(10_000, options.seconds, false), (1_000, 20, false), (1_000, options.seconds, true)]
+    {
+        println!("{}", measure(&options, &booster, (hertz, attacked), seconds)?);
     }
     let folder = tempfile::tempdir()?;
-    println!("{}", measure(&options, &largest(folder.path())?, 10, options.seconds)?);
+    println!("{}", measure(&options, &largest(folder.path())?, (10, false), options.seconds)?);
     Ok(())
 }
 
@@ -94,7 +97,12 @@ impl Drop for Daemon {
 }
 
 /// One line of the table.
-fn measure(options: &Options, campaign: &Campaign, hertz: u32, seconds: u32) -> Result<String, Box<dyn Error>> {
+fn measure(
+    options: &Options,
+    campaign: &Campaign,
+    (hertz, attacked): (u32, bool),
+    seconds: u32,
+) -> Result<String, Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
     let [port, page] = free_ports()?;
     let service = format!("orbitcal/bench/{}/{hertz}", std::process::id());
@@ -110,7 +118,12 @@ fn measure(options: &Options, campaign: &Campaign, hertz: u32, seconds: u32) -> 
             (20 * hertz).min(1000)
         ),
     )?;
-    let frames = wires(campaign, hertz, hertz * seconds)?;
+    let mut frames = wires(campaign, hertz, hertz * seconds)?;
+    if attacked {
+        for (number, frame) in frames.iter_mut().enumerate() {
+            *frame = [&attackers::damage(frame, number)[..], &[0], frame].concat();
+        }
+    }
     let mut subscriber = Subscriber::try_new(&service)?;
     let said = fs::File::create(folder.path().join("said"))?;
     let mut command = Command::new(&options.program);
@@ -118,9 +131,12 @@ fn measure(options: &Options, campaign: &Campaign, hertz: u32, seconds: u32) -> 
     let line = connect(port)?;
     let sent: Vec<AtomicU64> = frames.iter().map(|_| AtomicU64::new(0)).collect();
     let start = Instant::now();
+    let is_over = AtomicBool::new(!attacked);
     let (latencies, since_published) = thread::scope(|scope| {
+        scope.spawn(|| attackers::browse(page, &is_over));
         let sender = scope.spawn(|| send(line, &frames, &sent, start, hertz));
         let heard = hear(&mut subscriber, &sent, start, || sender.is_finished());
+        is_over.store(true, Ordering::Relaxed);
         sender.join().expect("the sender does not panic").map(|()| heard)
     })?;
     let lost = frames.len() - latencies.len();
@@ -134,8 +150,9 @@ fn measure(options: &Options, campaign: &Campaign, hertz: u32, seconds: u32) -> 
     let faults: Vec<&str> = said.lines().filter(|line| line.contains("so far")).collect();
     let (count, quantiles, faults) = (frames.len(), quantiles.join(", "), faults.join("; "));
     Ok(format!(
-        "{hertz:>6} {count:>8} {lost:>8} {late:>8}  {quantiles} {faults}\n       \
-         us, median and 99 %: frame in the daemon's queue to readers woken {in_daemon}; estimate stamped to read {of_reader}\n       {threads}"
+        "{hertz:>6} {count:>8} {lost:>8} {late:>8}  {quantiles} {}{faults}\n       \
+         us, median and 99 %: frame in the daemon's queue to readers woken {in_daemon}; estimate stamped to read {of_reader}\n       {threads}",
+        if attacked { "under attack " } else { "" }
     ))
 }
 
