@@ -90,8 +90,8 @@ fn kill(test: &str, kills: usize) {
     assert_eq!(left_by(&processes), [""; 0]);
     println!("frames lost by kills: {:?}", survivors.lost);
     assert_eq!(survivors.lost.len(), kills);
-    // a checkpoint that is being written at the kill is no whole one
-    assert!(survivors.lost.iter().all(|lost| *lost <= 2 * EVERY), "{:?}", survivors.lost);
+    // a checkpoint waits for work under way as long as one more interval, and is none while it is written; without any, lives would add up to thousands
+    assert!(survivors.lost.iter().all(|lost| *lost <= 4 * EVERY), "{:?}", survivors.lost);
     expect_one_core(&survivors);
 }
 
