@@ -357,7 +357,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             word: family.kind,
             class: family.class.clone(),
             count: family.members.len(),
-            mean: hierarchy.common(family) * width,
+            mean: family.mean(&hierarchy.off_priors()) * width,
             scatter: family.variance().sqrt() * width,
             ordinary: family.ordinary_scatter() * width,
             sigma: sigma[sigma.len() / 2],

@@ -1,4 +1,4 @@
-//! Families of unknowns: members of one kind and class have a common mean, and scatter about it by a scale that the measurement tells.
+//! Families of unknowns: members of one kind and class scatter about what is expected, or about something that they have in common, by a scale that the measurement tells.
 //!
 //! In units of the prior's width a member is `x_i = e + d_i` from what is expected beforehand, `e ~ N(0, f^2)` what all have in common and `d_i ~ N(0, s^2/w_i)`,
 //! `s` at most 1. With `e` integrated out the prior's precision of the `n` members is
@@ -51,7 +51,7 @@ pub const BEFOREHAND: f64 = 2.0;
 const TAILS: f64 = 4.0;
 /// Variance of normal members over the square of the scale that this distribution gives them, the `r` of `E (nu + 1) r x^2/(nu + r x^2) = 1`.
 const NORMAL: f64 = 1.48;
-/// What all members may be off together, in widths of the prior.
+/// What all members may be off together, in widths of the prior: as far as one.
 const FREEDOM: f64 = 1.0;
 
 /// Unknowns of one kind and class.
@@ -306,7 +306,7 @@ mod tests {
 
     #[test]
     fn the_precision_is_the_inverse_of_scatter_and_mean() {
-        for (kind, freedom) in [("bpm_gain", FREEDOM), ("skew_gradient", 0.0)] {
+        for (kind, freedom) in [("corrector_gain", FREEDOM), ("skew_gradient", 0.0)] {
             let family = Family { freedom, ..family(kind, 5, 0.3) };
             let mut precision = DMatrix::zeros(5, 5);
             family.add_precision(&mut precision);
@@ -351,7 +351,7 @@ mod tests {
 
     #[test]
     fn a_common_value_is_the_mean_and_no_scatter() {
-        let family = Family { weights: vec![1.0; 400], freedom: FREEDOM, ..family("bpm_gain", 400, 0.1) };
+        let family = Family { weights: vec![1.0; 400], freedom: FREEDOM, ..family("corrector_gain", 400, 0.1) };
         let found = family.deviations(&DVector::from_element(400, 0.05), &DMatrix::zeros(400, 400));
         // what is in common is drawn to 0 by (s/f)^2 of 400
         assert!(found.value.iter().all(|one| one.abs() < 0.05 * 0.01 / 400.0 * 1.01));

@@ -313,12 +313,8 @@ impl Hierarchy {
 
     /// What the members of an unknown's family have in common beyond their means beforehand.
     fn in_common(&self, unknown: usize) -> f64 {
-        self.family_of(unknown).map_or(0.0, |family| self.common(family)) * self.unknowns[unknown].width
-    }
-
-    /// The same of a family, in widths.
-    pub fn common(&self, family: &Family) -> f64 {
-        family.common(|member| self.off_prior(member))
+        let common = self.family_of(unknown).map_or(0.0, |family| family.common(|member| self.off_prior(member)));
+        common * self.unknowns[unknown].width
     }
 
     /// Standard deviation of that distance: what all members have in common is in both.
@@ -567,7 +563,8 @@ mod tests {
         let mean = nees / f64::from(strengths);
         assert!((0.4..1.5).contains(&mean), "NEES {mean}");
     }
-    /// Readings that are all a fifth larger are of the constant that kicks are told with, and of nothing else.
+
+    /// A matrix that is a fifth larger is of the constant that kicks are told with, and of nothing else.
     #[test]
     fn a_wrong_kick_constant_is_of_the_kicks_alone() {
         let (ring, settings) = (ring(), Settings::default());

@@ -215,7 +215,8 @@ impl Members {
                 let squared =
                     deviations.value.iter().zip(&deviations.variance).map(|(value, variance)| value * value + variance);
                 let normal = one.variance() / one.scale.powi(2);
-                squares.extend(squared.zip(&one.weights).map(|(square, weight)| normal * square * weight));
+                let weighted = squared.zip(&one.weights).map(|(square, weight)| normal * square * weight);
+                squares.extend(weighted.map(|square| if one.has_own_scale() { square } else { one.variance() }));
                 scatter.extend(one.members.iter().map(|_| one.scale * one.scale));
             }
         }

@@ -180,9 +180,7 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
     let worse = (!worst.is_empty())
         .then(|| format!("readings of {} are explained worse than those of others", worst.join(", ")));
     let nothing = findings.is_empty() && fitted.has_ended;
-    // straights that focus are findings, each by itself
-    let is_told = |one: &&Imperfection| one.is_large() && one.word != "wiggler_focusing";
-    let large = diagnosis.imperfections.iter().filter(is_told).map(|one| {
+    let large = diagnosis.imperfections.iter().filter(|one| one.is_large()).map(|one| {
         let [scatter, ordinary] = [one.scatter, one.ordinary].map(|value| number(value, unit(one.word)));
         format!("{} scatter by {scatter}, in an ordinary ring by {ordinary}", members(one.word, &one.class))
     });
