@@ -832,7 +832,7 @@ impl<
             restarted: screened.restarted,
             tune_innovation: screened.tune,
             setting: judged.cell,
-            log_evidence: finite(solution.log_evidence) as f32,
+            log_evidence: -finite(-solution.log_evidence) as f32,
             linearised: judged.linearised,
             remarks,
             health: judged.health,
@@ -912,7 +912,7 @@ impl<
     }
 }
 
-/// A number as estimates have it: what a state of absurd numbers makes infinite is as large as can be told.
+/// A number as estimates have it: what absurd numbers of a state make infinite or NaN is as large as can be told.
 fn finite(number: f64) -> f64 {
     let [least, most] = [f32::MIN, f32::MAX].map(f64::from);
     if number.is_nan() { most } else { number.clamp(least, most) }
