@@ -10,7 +10,7 @@ const HEAD: usize = 8192;
 /// Headers of a request.
 const HEADERS: usize = 64;
 /// How long a browser may take for its next request, and for each part of a reply.
-const PATIENCE: Duration = Duration::from_secs(10);
+const WAIT: Duration = Duration::from_secs(10);
 
 /// What was asked.
 #[derive(Debug, PartialEq, Eq)]
@@ -45,8 +45,8 @@ impl Reply {
     /// With its headers.
     fn bytes(&self, headers: &[(&str, &str)], asked: Option<&Request>) -> Vec<u8> {
         let connection = if asked.is_some_and(|request| request.stays) { "keep-alive" } else { "close" };
-        let own = [("Content-Type", self.kind), ("Connection", connection)];
-        let headers: String = own.iter().chain(headers).map(|(name, value)| format!("{name}: {value}\r\n")).collect();
+        let first = [("Content-Type", self.kind), ("Connection", connection)];
+        let headers: String = first.iter().chain(headers).map(|(name, value)| format!("{name}: {value}\r\n")).collect();
         let body = if asked.is_some_and(|request| request.method == "HEAD") { "" } else { &self.body };
         let (status, length) = (self.status, self.body.len());
         format!("HTTP/1.1 {status}\r\nContent-Length: {length}\r\n{headers}\r\n{body}").into_bytes()
@@ -62,7 +62,7 @@ pub fn converse(
     headers: &[(&str, &str)],
     answer: impl Fn(&Request) -> Reply,
 ) -> std::io::Result<()> {
-    browser.set_write_timeout(Some(PATIENCE))?;
+    browser.set_write_timeout(Some(WAIT))?;
     let mut heard = Vec::with_capacity(HEAD);
     loop {
         let (reply, request) = match next(&mut browser, &mut heard)? {
@@ -84,7 +84,7 @@ enum Next {
 }
 
 fn next(browser: &mut TcpStream, heard: &mut Vec<u8>) -> std::io::Result<Next> {
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT;
     loop {
         match parsed(heard) {
             Ok(Some((request, length))) => {
@@ -93,7 +93,7 @@ fn next(browser: &mut TcpStream, heard: &mut Vec<u8>) -> std::io::Result<Next> {
             }
             Ok(None) if heard.len() < HEAD => (),
             Ok(None) => return Ok(Next::Refused("431 Request Header Fields Too Large")),
-            Err(()) => return Ok(Next::Refused("400 Bad Request")),
+            Err(_) => return Ok(Next::Refused("400 Bad Request")),
         }
         let left = end.saturating_duration_since(Instant::now());
         if left.is_zero() {
@@ -109,10 +109,10 @@ fn next(browser: &mut TcpStream, heard: &mut Vec<u8>) -> std::io::Result<Next> {
 }
 
 /// The first request of some bytes, with the length of its head; none where it goes on.
-fn parsed(bytes: &[u8]) -> Result<Option<(Request, usize)>, ()> {
+fn parsed(bytes: &[u8]) -> Result<Option<(Request, usize)>, httparse::Error> {
     let mut headers = [httparse::EMPTY_HEADER; HEADERS];
     let mut head = httparse::Request::new(&mut headers);
-    let httparse::Status::Complete(length) = head.parse(bytes).map_err(|_| ())? else { return Ok(None) };
+    let httparse::Status::Complete(length) = head.parse(bytes)? else { return Ok(None) };
     let value = |name: &str| {
         let header = head.headers.iter().find(|header| header.name.eq_ignore_ascii_case(name));
         header.map(|header| String::from_utf8_lossy(header.value).into_owned())

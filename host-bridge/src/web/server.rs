@@ -1,10 +1,9 @@
 //! The server of the page: it reads the board, whoever asks, and changes nothing.
 
 use core::net::SocketAddr;
-use core::sync::atomic::{AtomicUsize, Ordering};
 use core::time::Duration;
 use std::net::TcpListener;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 
 use super::board::Board;
@@ -57,26 +56,28 @@ pub fn start(address: SocketAddr, board: &Arc<Board>) -> Result<SocketAddr, WebE
 }
 
 fn listen(listener: &TcpListener, board: &Arc<Board>) {
-    let open = Arc::new(AtomicUsize::new(0));
+    // one reply is made at a time, so that however many are asked for the loop keeps its processor; each connection has a part of it
+    let turn = Arc::new(Mutex::new(()));
     for browser in listener.incoming() {
         let Ok(browser) = browser else {
-            // no file is left for it
+            // no file descriptor is free
             thread::sleep(Duration::from_millis(100));
             continue;
         };
-        if open.load(Ordering::Relaxed) >= CONNECTIONS {
+        if Arc::strong_count(&turn) > CONNECTIONS {
             continue;
         }
-        let (board, own) = (board.clone(), open.clone());
-        own.fetch_add(1, Ordering::Relaxed);
+        let (board, turn) = (board.clone(), turn.clone());
         let serve = move || {
+            let answer = |request: &Request| {
+                let _turn = turn.lock().unwrap_or_else(PoisonError::into_inner);
+                reply(request, &board)
+            };
             // whoever asked may be gone
-            let _ = converse(browser, HEADERS, |request| reply(request, &board));
-            own.fetch_sub(1, Ordering::Relaxed);
+            let _ = converse(browser, HEADERS, answer);
         };
-        if thread::Builder::new().name("page".into()).spawn(serve).is_err() {
-            open.fetch_sub(1, Ordering::Relaxed);
-        }
+        // without a thread the connection ends
+        let _ = thread::Builder::new().name("page".into()).spawn(serve);
     }
 }
 
@@ -106,6 +107,6 @@ fn reply(request: &Request, board: &Board) -> Reply {
 
 /// True of a name of this machine: a page from elsewhere, whose name was made to point here, is not served.
 fn is_of_this_machine(host: &str) -> bool {
-    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
+    let name = host.rsplit_once(':').filter(|(_, port)| !port.contains(']')).map_or(host, |(name, _)| name);
     name == "localhost" || name.trim_matches(['[', ']']).parse().is_ok_and(|ip: core::net::IpAddr| ip.is_loopback())
 }

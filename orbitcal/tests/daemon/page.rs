@@ -92,6 +92,7 @@ fn the_page_the_numbers_and_the_metrics_are_read_and_nothing_is_changed() {
             ("GET", "/trail.json?span=hour&var=Z9", "localhost", 404),
             ("GET", "/", "evil.example", 421),
             ("GET", "/", "[::1]:9464", 200),
+            ("GET", "/", "[::1]", 200),
         ] {
             assert_eq!(ask(page, method, path, host).0, status, "{method} {path} {host}");
         }
