@@ -832,6 +832,7 @@ impl<
             restarted: screened.restarted,
             tune_innovation: screened.tune,
             setting: judged.cell,
+            // without a number it is none
             log_evidence: -finite(-solution.log_evidence) as f32,
             linearised: judged.linearised,
             remarks,

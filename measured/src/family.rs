@@ -256,14 +256,17 @@ impl Family {
 
     /// Mean of the members' values.
     pub fn mean(&self, values: &DVector<f64>) -> f64 {
-        let weighted = self.members.iter().zip(&self.weights).map(|(&member, weight)| weight * values[member]);
-        weighted.sum::<f64>() / self.weights.iter().sum::<f64>()
+        self.weighted(|member| values[member]) / self.weights.iter().sum::<f64>()
     }
 
     /// What distances of the members have in common.
     pub fn common(&self, distance: impl Fn(usize) -> f64) -> f64 {
-        let weighted = self.members.iter().zip(&self.weights).map(|(&i, weight)| weight * distance(i));
-        self.shared() * weighted.sum::<f64>()
+        self.shared() * self.weighted(distance)
+    }
+
+    /// Weighted sum over the members.
+    fn weighted(&self, number: impl Fn(usize) -> f64) -> f64 {
+        self.members.iter().zip(&self.weights).map(|(&member, weight)| weight * number(member)).sum()
     }
 
     /// Deviations from what they have in common by the posterior of all unknowns.

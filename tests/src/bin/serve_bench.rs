@@ -131,9 +131,11 @@ fn measure(
     let line = connect(port)?;
     let sent: Vec<AtomicU64> = frames.iter().map(|_| AtomicU64::new(0)).collect();
     let start = Instant::now();
-    let is_over = AtomicBool::new(!attacked);
+    let is_over = AtomicBool::new(false);
     let (latencies, since_published) = thread::scope(|scope| {
-        scope.spawn(|| attackers::browse(page, &is_over));
+        if attacked {
+            scope.spawn(|| attackers::browse(page, &is_over));
+        }
         let sender = scope.spawn(|| send(line, &frames, &sent, start, hertz));
         let heard = hear(&mut subscriber, &sent, start, || sender.is_finished());
         is_over.store(true, Ordering::Relaxed);
