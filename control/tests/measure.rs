@@ -9,7 +9,7 @@ use control::{
     Channel, Control, ControlError, Journal, MeasureError, Plan, Sample, SessionError, Step, measure, preflight,
     recording, restore,
 };
-use inference::{BatchFit, Campaign, Recording, TuneUse, simulate};
+use inference::{BaseModel, BatchFit, Campaign, Recording, TuneUse, simulate};
 use nalgebra::DVector;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -71,7 +71,8 @@ fn written(plan: &Plan, ring: &Ring, journal: &Journal, folder: &TempDir) -> Rec
 
 /// Normalised estimation error squared over the number of vars, 1 expected.
 fn nees(recording: &Recording, ring: &Ring, seed: u64) -> f64 {
-    let fit = BatchFit::best(&Campaign::of(ring, recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
+    let fit =
+        BatchFit::best(&Campaign::of(ring, recording).unwrap(), TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
     let truth = simulate::vars(ring, true, seed).unwrap();
     let error = DVector::from_fn(truth.len(), |i, _| fit.map_params[i] - truth[i].ln());
     let solved = fit.covariance.cholesky().unwrap().solve(&error);

@@ -9,7 +9,6 @@ use super::error::FitError;
 use super::experiment::Proposal;
 use super::heldout::{self, Score};
 use super::hypothesis::in_order;
-use super::imperfection::Imperfection;
 use super::out_of_range::OutOfRange;
 use super::readback::Contradiction;
 use super::scan;
@@ -19,6 +18,7 @@ use super::transients::{self, Transient, Transients};
 use super::verdict::{self, Finding, Verdict};
 use super::widths;
 use super::wiring::Miswired;
+use inference::Imperfection;
 
 /// What is missing in the model of a recording.
 #[derive(Debug, Clone)]

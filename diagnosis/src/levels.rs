@@ -16,7 +16,7 @@ use core::ops::Range;
 use nalgebra::DMatrix;
 use twin::{Measured, Unit};
 
-use super::imperfection::{Imperfection, Measure};
+use inference::{Imperfection, Measure};
 
 /// Frames in which the noise of all monitors is larger.
 #[derive(Debug, Clone, PartialEq)]

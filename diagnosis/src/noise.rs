@@ -16,7 +16,6 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
 
 use super::frame_pattern::{self, Found, FrameToFrame, Known, Like, Shape};
-use super::imperfection::{Imperfection, Measure, POSITION};
 use super::jitter::{CRATE, Crate, Differences, groups, with_column, with_crates};
 use super::levels::{Levels, Part};
 use super::memory::Memory;
@@ -27,6 +26,7 @@ use super::repeats::{Repeats, Run};
 use super::scale::{ALIKE, QUOTED, Scales};
 use super::slow_noise::{SHARE, Slow, steps};
 use inference::Campaign;
+use inference::{Imperfection, Measure, POSITION};
 
 /// What was learnt of the noise. A value is 0 (a scale 1) where there is no sign of it; its error is then the root mean square that the
 /// recording allows.

@@ -13,7 +13,6 @@ use super::experiment::Menu;
 use super::family::family_of;
 use super::fit::Fitted;
 use super::heldout::{Block, Score, gain_of_choice, lessened, reduced};
-use super::imperfection::{Imperfection, POSITION};
 use super::limits::Limits;
 use super::location::Location;
 use super::lost_frames::LostFrames;
@@ -29,6 +28,7 @@ use super::term::Term;
 use super::tested::Tested;
 use super::transients::Transient;
 use super::widths;
+use inference::{Imperfection, POSITION};
 
 /// The result of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

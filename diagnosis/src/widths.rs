@@ -25,10 +25,10 @@ use super::data::Data;
 use super::family::{Family, Grouping, family_of};
 use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
-use super::imperfection::{Imperfection, Measure};
 use super::scatter::{self, Scatter};
 use super::term::Term;
 use super::unknown::{Member, Unknown};
+use inference::{Imperfection, Measure};
 
 /// Widths of its family from which on a member stands out: of 48 of a normal distribution the largest is 2.3 on average.
 pub(super) const STANDS_OUT: f64 = 2.3;

@@ -2,14 +2,14 @@
 //! reference, and simulated campaigns.
 //!
 //! ```
-//! use inference::{BatchFit, Campaign, Recording, TuneUse};
+//! use inference::{BaseModel, BatchFit, Campaign, Recording, TuneUse};
 //! use twin::Ring;
 //!
 //! let ring = Ring::booster();
 //! let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
 //! let recording = Recording::read(folder.as_ref(), &ring)?;
 //! let campaign = Campaign::of(&ring, &recording)?; // settings, and which readings count
-//! let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ())?;
+//! let fit = BatchFit::best(&campaign, TuneUse::LeftOut, BaseModel::UNCERTAIN, |_| ())?;
 //! assert!((0.9..1.1).contains(&fit.chi2_per_dof));
 //! let left_out: usize = (0..campaign.monitors()).map(|b| campaign.screened.excluded.tally(b).values().sum::<usize>()).sum();
 //! assert!(left_out > 0 && 10 * left_out < campaign.frames() * campaign.monitors());
@@ -18,11 +18,13 @@
 //!
 //! Four modules are public by name, since their functions read as `stream::replay` or `simulate::vars`.
 
+mod base_model;
 mod bounds;
 mod campaign;
 mod cmdstan;
 mod diagnostics;
 mod draws;
+mod imperfection;
 mod map_fit;
 mod model;
 pub mod nuts;
@@ -34,6 +36,7 @@ pub mod recording;
 pub mod simulate;
 pub mod stream;
 
+pub use base_model::{BaseModel, BaseTerm, FittedTerm};
 pub use bounds::{Bounded, Coordinate, Coordinates, softplus};
 pub use campaign::{
     Campaign, Excluded, Exclusions, Meter, Screened, Setting, Settings, Stray, TUNE_CALIBRATION, Times, chi_square,
@@ -41,7 +44,8 @@ pub use campaign::{
 };
 pub use diagnostics::{mcse_sd, quantile};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
-pub use map_fit::{BatchError, BatchFit, FittedTune, Lack, TuneUse};
+pub use imperfection::{Imperfection, Measure, POSITION};
+pub use map_fit::{BatchError, BatchFit, FittedOptics, FittedTune, Lack, TuneUse};
 pub use model::{GreenModel, ResnetModel, ResponseModel};
 pub use optimise::{End, Limits, Objective, OptimiseError, Quadratic, minimise};
 pub use posterior::{Laplace, LaplaceError, Posterior};

@@ -7,24 +7,28 @@
 //!
 //! minimised by damped Gauss-Newton within the range of the params. A baseline follows the supplies and the RF frequency
 //! ([`Campaign::following`], spurious dispersion): `baseline_b + sum of u_bf following_bf`, with the squares of the unknown `u_bf` added
-//! to chi-square; they are eliminated as the baselines are.
+//! to chi-square; they are eliminated as the baselines are. A design that is not exact has a few amplitudes more ([`BaseModel`]).
 
 use core::fmt;
 
 use estimator::{FitQuality, Marginal};
 use nalgebra::{DMatrix, DVector, Vector2};
-use twin::{OrbitError, Tunes};
+use twin::{CalibratedOptics, Measured, OrbitError, Tunes, Twiss};
 
+use crate::base_model::{BaseModel, BaseTerm, FittedTerm};
 use crate::campaign::{AtTimes, Campaign, Normal, Terms, Weighed, chi_square};
 use crate::optimise::{End, Limits, Objective, OptimiseError, Optimum, Quadratic, minimise};
+use crate::prior::Prior;
 
 /// The batch result for one campaign.
 #[derive(Debug, Clone)]
 pub struct BatchFit {
     /// MAP of each `theta = ln var`, within the prior's range.
     pub map_params: Vec<f64>,
-    /// Covariance of theta.
+    /// Covariance of theta, whatever the base model's terms are.
     pub covariance: DMatrix<f64>,
+    /// The same of theta and, after it, of the base model's terms.
+    pub joint_covariance: DMatrix<f64>,
     /// Marginal of each theta.
     pub marginals: Vec<Marginal>,
     /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, per degree of freedom (readings less baselines, less
@@ -38,6 +42,10 @@ pub struct BatchFit {
     pub lack: Option<Lack>,
     /// Rms of the baselines in x and y [m].
     pub orbit: [f64; 2],
+    /// What the design is off by, of the terms that were fitted.
+    pub base: Vec<FittedTerm>,
+    /// The base model that was fitted.
+    pub base_model: BaseModel,
     /// Gauss-Newton steps taken.
     pub steps: usize,
 }
@@ -128,13 +136,19 @@ impl BatchFit {
     ///
     /// # Errors
     /// [`BatchError`].
-    pub fn best(campaign: &Campaign, tunes: TuneUse, mut progress: impl FnMut(usize)) -> Result<Self, BatchError> {
-        let problem = Problem { campaign, tunes };
+    pub fn best(
+        campaign: &Campaign,
+        tunes: TuneUse,
+        base: BaseModel,
+        mut progress: impl FnMut(usize),
+    ) -> Result<Self, BatchError> {
+        let problem = Problem { campaign, tunes, base, prior: base.prior(&campaign.prior) };
+        let start = campaign.params.clone().resize_vertically(problem.prior.len(), 0.0);
         let watch = |steps, _| {
             progress(steps);
             true
         };
-        let found = minimise(&problem, &campaign.params, &campaign.prior.range, &LIMITS, watch)?;
+        let found = minimise(&problem, &start, &problem.prior.range, &LIMITS, watch)?;
         if found.end == End::Exhausted && found.expected > CLOSE {
             return Err(BatchError::NotConverged { steps: found.steps, moved: found.expected.max(0.0).sqrt() });
         }
@@ -142,10 +156,39 @@ impl BatchFit {
     }
 }
 
+/// Optics functions of a fit, and their standard deviations.
+pub type FittedOptics = (CalibratedOptics, (Vec<Twiss>, Tunes));
+
+impl BatchFit {
+    /// Theta and, after it, the amplitudes of the base model's terms.
+    pub(crate) fn values(&self) -> Vec<f64> {
+        let amplitudes = self.base.iter().map(|fitted| fitted.measured.value);
+        self.map_params.iter().copied().chain(amplitudes).collect()
+    }
+
+    /// The optics of the ring as fitted, at the campaign's mean supplies, `sigma^2 = J C J^T`.
+    ///
+    /// # Errors
+    /// [`OrbitError`] of unstable motion.
+    pub fn optics(&self, campaign: &Campaign) -> Result<FittedOptics, OrbitError> {
+        let Campaign { ring, supplies, .. } = campaign;
+        let fitted_ring = |values: &[f64]| {
+            let (params, amplitudes) = values.split_at(self.map_params.len());
+            self.base_model.ring(&ring.with_strengths(&ring.strengths(params, supplies)), amplitudes)
+        };
+        let optics = CalibratedOptics::at(&self.values(), fitted_ring)?;
+        let sigma = optics.sigma(&self.joint_covariance);
+        Ok((optics, sigma))
+    }
+}
+
 /// One campaign and how it is to be read.
 struct Problem<'c> {
     campaign: &'c Campaign,
     tunes: TuneUse,
+    base: BaseModel,
+    /// Of the params and, after them, of the base model's terms.
+    prior: Prior,
 }
 
 /// What a fit knows at given params.
@@ -166,15 +209,14 @@ impl Objective for Problem<'_> {
     type Error = OrbitError;
 
     fn evaluate(&self, params: &DVector<f64>) -> Result<(f64, Point), OrbitError> {
-        let prior = &self.campaign.prior;
-        let linearised = self.campaign.linearised(params)?;
+        let linearised = self.campaign.linearised(self.base, params)?;
         let (mut normal, chi2) = self.orbits(params, &linearised);
         let (_, of_orbits) = normal.eliminated();
         if self.tunes == TuneUse::Readings {
             self.add_tunes(&mut normal, &linearised);
         }
         let (cost, quadratic) = normal.eliminated();
-        let here = DVector::zeros(prior.len());
+        let here = DVector::zeros(params.len());
         let orbit = self.campaign.rms_by_plane(&normal.baselines(&here));
         Ok((cost, Point { quadratic, of_orbits: of_orbits.matrix, chi2, orbit, tunes: linearised.at_mean.tunes }))
     }
@@ -191,7 +233,7 @@ impl Problem<'_> {
         let (orbits, slopes) = (linearised.orbits(&campaign.drives), linearised.slopes(&campaign.drives));
         let baselines = campaign.times.count();
         let common = Terms { count: baselines + 1 + campaign.supplies.len(), baselines, precision: 0.0 };
-        let mut normal = Normal::new(&campaign.prior, params, campaign.monitors(), common);
+        let mut normal = Normal::new(&self.prior, params, campaign.monitors(), common);
         let (mut chi2, mut freedom) = (0.0, -(params.len() as f64));
         for (b, slopes) in slopes.iter().enumerate() {
             let terms = campaign.terms(b);
@@ -226,7 +268,7 @@ impl Problem<'_> {
     }
 
     fn result(&self, found: &Optimum<Self>) -> Result<BatchFit, BatchError> {
-        let (prior, point) = (&self.campaign.prior, &found.point);
+        let (prior, point, vars) = (&self.campaign.prior, &found.point, self.campaign.prior.len());
         let factor = point.quadratic.factor().ok_or(BatchError::Degenerate)?;
         let covariance = factor.inverse();
         let unbounded = &found.x + factor.solve(&point.quadratic.slope);
@@ -239,10 +281,17 @@ impl Problem<'_> {
             let meter = self.campaign.meters[plane].as_ref();
             FittedTune { model, measured: meter.map(|meter| (meter.near(model), meter.sigma)) }
         };
+        let fitted_term = |(at, &term): (usize, &BaseTerm)| {
+            let measured = Measured { value: found.x[vars + at], sigma: covariance[(vars + at, vars + at)].sqrt() };
+            FittedTerm { term, measured }
+        };
         Ok(BatchFit {
-            marginals: (0..prior.len()).map(marginal).collect(),
-            map_params: found.x.iter().copied().collect(),
-            covariance,
+            marginals: (0..vars).map(marginal).collect(),
+            map_params: found.x.iter().take(vars).copied().collect(),
+            base: self.base.terms().iter().enumerate().map(fitted_term).collect(),
+            base_model: self.base,
+            covariance: covariance.view_range(..vars, ..vars).into_owned(),
+            joint_covariance: covariance,
             chi2_per_dof: if point.chi2.1 > 0.0 { point.chi2.0 / point.chi2.1 } else { f64::NAN },
             mismatch: quality(point.chi2).is_mismatch(),
             tunes: [tune(0, point.tunes.x), tune(1, point.tunes.y)],

@@ -9,6 +9,7 @@ mod linear;
 mod resnet;
 
 use nalgebra::DMatrix;
+use serde::Serialize;
 use twin::{OrbitError, Ring, VariedOptics, VariedRing};
 
 use crate::stream::StreamError;
@@ -148,7 +149,7 @@ impl ResponseModel {
 }
 
 /// What a model predicts, or the derivative of a function of it.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Prediction {
     /// Rows monitors, columns correctors and the RF.
     pub response: DMatrix<f64>,

@@ -9,13 +9,17 @@
 //! subtracted from the readings beforehand, at the MAP: the frame's own supply currents, which scatter by 2e-4 (they move an
 //! orbit by up to 3 um, and by less than 0.1 um differently within the posterior), and the second order of the RF orbit.
 //!
-//! Two data modes: all frames with baselines ([`Readings::of_frames`]), and, as the paper did, differences of one frame pair
+//! The amplitudes `d` of a base model ([`crate::BaseModel`]), off those of the fit, add `S d` to the response, with its derivatives S at the fit. At their
+//! best they are eliminated: they are normal, so that chi-square is then that of the vars alone.
+//!
+//! Two data modes: all frames with baselines ([`Readings::of_frames`]), and, as the paper did with a model taken for exact, differences of one frame pair
 //! a corrector ([`Readings::of_pairs`]).
 
 use nalgebra::{DMatrix, DVector, Vector2};
 use serde::Serialize;
 use twin::OrbitError;
 
+use crate::base_model::FittedTerm;
 use crate::campaign::{Campaign, Common, Eliminated, Meter, Weighed};
 use crate::map_fit::{BatchFit, TuneUse};
 use crate::model::{Prediction, ResponseModel};
@@ -29,12 +33,30 @@ pub struct Reduced {
     pub fit: BatchFit,
     /// Readings at the mean supply currents, first order in the RF offset, rows frames, columns monitors [m].
     readings: DMatrix<f64>,
+    /// Factor of the base model, as fitted, on each drive: kicks and RF offset.
+    factors: DVector<f64>,
+    /// Derivatives by its terms.
+    base: Vec<BaseSlope>,
+}
+
+/// Derivative of what a model predicts by one term of the base model, at the fit.
+#[derive(Debug, Clone, Serialize)]
+struct BaseSlope {
+    /// As [`Prediction::response`].
+    response: DMatrix<f64>,
+    /// Of the tunes.
+    tunes: Vector2<f64>,
+    /// Amplitude at the fit.
+    value: f64,
+    /// One over the variance of its prior.
+    precision: f64,
 }
 
 /// The quadratic forms, and the tunes.
 #[derive(Debug, Clone, Serialize)]
 pub struct Readings {
     forms: Vec<Form>,
+    base: Base,
     /// Measured tunes, where they count.
     meters: [Option<Meter>; 2],
     /// `ln` of each quadrupole's supply factor [M].
@@ -50,6 +72,16 @@ struct Form {
     gram: DMatrix<f64>,
     moment: DVector<f64>,
     square: f64,
+}
+
+/// The terms of a base model, eliminated.
+#[derive(Debug, Clone, Serialize)]
+struct Base {
+    slopes: Vec<BaseSlope>,
+    /// What a unit of each adds to the derivative of chi-square by the prediction.
+    weights: Vec<Prediction>,
+    /// Inverse of half the second derivative of chi-square with respect to the amplitudes.
+    inverse: DMatrix<f64>,
 }
 
 /// Two frames of one corrector.
@@ -68,21 +100,30 @@ impl Reduced {
     /// [`OrbitError`] if these have no closed orbit.
     pub fn from_fit(campaign: Campaign, fit: BatchFit) -> Result<Self, OrbitError> {
         let Campaign { ring, supplies, drives, .. } = &campaign;
-        let params = DVector::from_column_slice(&fit.map_params);
-        let exact = campaign.linearised(&params)?.orbits(drives);
+        let (vars, values) = (fit.map_params.len(), fit.values());
+        let amplitudes = &values[vars..];
+        let linearised = campaign.linearised(fit.base_model, &DVector::from_column_slice(&values))?;
+        let exact = linearised.orbits(drives);
+        let factors = fit.base_model.kick_factors(ring, amplitudes).push(fit.base_model.rf_factor(amplitudes));
         let strength: Vec<f64> = ring.strengths(&fit.map_params, supplies).iter().map(|factor| factor.ln()).collect();
         let response = ResponseModel::twin(ring)?.predict(&strength)?.response;
         let mut readings = &campaign.readings - exact;
         for (mut row, drive) in readings.row_iter_mut().zip(drives) {
-            row += (&response * drive.kick.push(drive.rf_offset)).transpose();
+            row += (&response * drive.kick.push(drive.rf_offset).component_mul(&factors)).transpose();
         }
-        Ok(Self { campaign, fit, readings })
+        let slope = |(at, fitted): (usize, &FittedTerm)| {
+            let (mut response, tunes) = linearised.at_mean.slope(vars + at);
+            response.column_iter_mut().zip(factors.iter()).for_each(|(mut column, factor)| column /= *factor);
+            BaseSlope { response, tunes, value: fitted.measured.value, precision: fitted.term.width().powi(-2) }
+        };
+        let base = fit.base.iter().enumerate().map(slope).collect();
+        Ok(Self { campaign, fit, readings, factors, base })
     }
 
-    /// Drive of a frame as a row of the response: kicks, RF offset.
+    /// Drive of a frame as a row of the response: kicks, RF offset, with the factors of the base model.
     pub fn drive(&self, frame: usize) -> DVector<f64> {
         let drive = &self.campaign.drives[frame];
-        drive.kick.push(drive.rf_offset)
+        drive.kick.push(drive.rf_offset).component_mul(&self.factors)
     }
 
     /// Reading of a monitor in a frame, if it counts, at the mean supply currents [m].
@@ -117,11 +158,13 @@ impl Reduced {
     }
 
     /// The forms of all monitors beside tunes and circuits.
-    fn readings(&self, forms: Vec<Form>, tunes: TuneUse) -> Readings {
+    fn readings(&self, forms: Vec<Form>, tunes: TuneUse, base: &[BaseSlope]) -> Readings {
         let ring = &self.campaign.ring;
+        let meters = if tunes == TuneUse::Readings { self.campaign.meters.clone() } else { [None, None] };
         Readings {
+            base: Base::eliminated(base.to_vec(), &forms, &meters),
             forms,
-            meters: if tunes == TuneUse::Readings { self.campaign.meters.clone() } else { [None, None] },
+            meters,
             supplies: self.strength(&[]),
             parameters: ring.quadrupoles.iter().map(|quadrupole| quadrupole.parameter).collect(),
             dimension: ring.parameters.len(),
@@ -150,7 +193,7 @@ impl Readings {
             gram.gemm(-1.0, &columns, &columns.transpose(), 1.0);
             Form { gram, moment, square }
         };
-        reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), tunes)
+        reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), tunes, &reduced.base)
     }
 
     /// Differences of frame pairs, each independent of the others; no tunes, as in the paper.
@@ -170,7 +213,7 @@ impl Readings {
             }
             form
         };
-        reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), TuneUse::LeftOut)
+        reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), TuneUse::LeftOut, &[])
     }
 
     /// `ln` of the factor on each quadrupole's gradient at some params [M].
@@ -190,6 +233,19 @@ impl Readings {
 
     /// Chi-square of a prediction, and its derivative with respect to each number of it.
     pub fn chi_square(&self, predicted: &Prediction) -> (f64, Prediction) {
+        let (fitted, mut weights) = self.as_fitted(predicted);
+        let slope = self.base.pull(&weights);
+        let amplitudes = -(&self.base.inverse * &slope);
+        // the derivative is linear in the prediction
+        for (more, &amplitude) in self.base.weights.iter().zip(amplitudes.iter()) {
+            weights.response.zip_apply(&more.response, |weight, more| *weight += more * amplitude);
+            weights.tunes.iter_mut().zip(more.tunes).for_each(|(weight, more)| *weight += more * amplitude);
+        }
+        (fitted + self.base.cost() + slope.dot(&amplitudes), weights)
+    }
+
+    /// The same with the base model as fitted, without its prior.
+    fn as_fitted(&self, predicted: &Prediction) -> (f64, Prediction) {
         let response = &predicted.response;
         let (mut chi_square, mut weights) = (0.0, DMatrix::zeros(response.nrows(), response.ncols()));
         let (mut rho, mut image) = (DVector::zeros(response.ncols()), DVector::zeros(response.ncols()));
@@ -210,24 +266,33 @@ impl Readings {
         (chi_square, Prediction { response: weights, tunes })
     }
 
-    /// Half the second derivative of chi-square with respect to the params, that of the prediction left out: `sum of J^T A J`.
+    /// Half the second derivative of chi-square with respect to the params, that of the prediction left out: `sum of J^T A J`, less what the base
+    /// model takes.
     ///
     /// # Errors
     /// [`OrbitError`] where there is no stable ring.
     pub fn curvature(&self, model: &ResponseModel, params: &[f64]) -> Result<DMatrix<f64>, OrbitError> {
         let (jacobian, tune_slopes) = model.jacobian(&self.strength(params))?;
         let mut curvature = DMatrix::zeros(self.dimension, self.dimension);
-        for (form, of_quadrupoles) in self.forms.iter().zip(&jacobian) {
+        let of_base = &self.base.weights;
+        let mut mixed: DMatrix<f64> = DMatrix::zeros(of_base.len(), self.dimension);
+        for (b, (form, of_quadrupoles)) in self.forms.iter().zip(&jacobian).enumerate() {
             let j = self.gather_columns(of_quadrupoles);
+            for (mut row, base) in mixed.row_iter_mut().zip(of_base) {
+                row += base.response.row(b) * &j / 2.0;
+            }
             curvature += j.tr_mul(&(&form.gram * &j));
         }
         let tune_slopes = self.gather_columns(&tune_slopes);
         for (plane, meter) in self.meters.iter().enumerate() {
             let Some(meter) = meter else { continue };
             let slope = tune_slopes.row(plane).transpose();
+            for (mut row, base) in mixed.row_iter_mut().zip(of_base) {
+                row += slope.transpose() * (base.tunes[plane] / 2.0);
+            }
             curvature.ger(meter.whiten.column(0).norm_squared(), &slope, &slope, 1.0);
         }
-        Ok(curvature)
+        Ok(curvature - mixed.tr_mul(&(&self.base.inverse * &mixed)))
     }
 
     /// Columns of quadrupoles as columns of params.
@@ -237,6 +302,46 @@ impl Readings {
             parameter.iter().for_each(|&parameter| gathered.column_mut(parameter).axpy(1.0, &column, 1.0));
         }
         gathered
+    }
+}
+
+impl Base {
+    fn eliminated(slopes: Vec<BaseSlope>, forms: &[Form], meters: &[Option<Meter>; 2]) -> Self {
+        let weights: Vec<Prediction> = slopes.iter().map(|one| one.weights(forms, meters)).collect();
+        let normal = DMatrix::from_fn(slopes.len(), slopes.len(), |i, j| {
+            let prior = if i == j { slopes[i].precision } else { 0.0 };
+            slopes[i].along(&weights[j]) / 2.0 + prior
+        });
+        let inverse = normal.cholesky().expect("a prior's precision is positive").inverse();
+        Self { slopes, weights, inverse }
+    }
+
+    /// Half the derivative of chi-square by the amplitudes, given that by the prediction.
+    fn pull(&self, weights: &Prediction) -> DVector<f64> {
+        let each = self.slopes.iter().map(|one| one.along(weights) / 2.0 + one.precision * one.value);
+        DVector::from_iterator(self.slopes.len(), each)
+    }
+
+    /// Squares of the amplitudes as fitted, in widths.
+    fn cost(&self) -> f64 {
+        self.slopes.iter().map(|one| one.precision * one.value.powi(2)).sum()
+    }
+}
+
+impl BaseSlope {
+    /// What a unit of the amplitude changes of a function of the prediction with these derivatives.
+    fn along(&self, weights: &Prediction) -> f64 {
+        self.response.dot(&weights.response) + self.tunes.dot(&Vector2::from(weights.tunes))
+    }
+
+    /// What a unit of the amplitude adds to the derivative of chi-square by the prediction.
+    fn weights(&self, forms: &[Form], meters: &[Option<Meter>; 2]) -> Prediction {
+        let mut response = self.response.clone();
+        for (b, form) in forms.iter().enumerate() {
+            response.set_row(b, &(self.response.row(b) * &form.gram * 2.0));
+        }
+        let squared = |plane: usize| meters[plane].as_ref().map_or(0.0, |meter| meter.whiten.column(0).norm_squared());
+        Prediction { response, tunes: [0, 1].map(|plane| 2.0 * self.tunes[plane] * squared(plane)) }
     }
 }
 
@@ -259,6 +364,7 @@ mod tests {
     use twin::Ring;
 
     use super::*;
+    use crate::base_model::BaseModel;
     use crate::recording::Recording;
 
     /// A recording of format 2 need not name the correctors that were set.
@@ -269,7 +375,7 @@ mod tests {
         let mut recording = Recording::read(&folder.join("plain"), &ring).unwrap();
         let repeats = |recording: &Recording| {
             let campaign = Campaign::of(&ring, recording).unwrap();
-            let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ()).unwrap();
+            let fit = BatchFit::best(&campaign, TuneUse::LeftOut, BaseModel::EXACT, |_| ()).unwrap();
             Reduced::from_fit(campaign, fit).unwrap().repeats()
         };
         let named = repeats(&recording);

@@ -7,7 +7,9 @@ use std::sync::Arc;
 use inference::nuts::{self, NutsSettings};
 use inference::recording::BelievedRf;
 use inference::simulate::{self, Instruments};
-use inference::{BatchFit, Campaign, Drive, Lack, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::{
+    BaseModel, BatchFit, Campaign, Drive, Lack, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse,
+};
 use nalgebra::DVector;
 use serde_json::{Value, json};
 use twin::{Effect, Machine, Rf, Ring};
@@ -240,7 +242,7 @@ fn without_a_kick_or_a_reading_the_result_is_the_prior_and_says_so() {
         println!("{lack}: furthest param {furthest:.3} prior sigma from its mean");
         // orbits that take less than a tenth of a width away move its mean by 0.44 of it: sqrt(1 - 0.9^2)
         assert!(furthest < 0.44, "{lack}: {furthest}");
-        let tuned = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let tuned = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
         assert_eq!(tuned.lack, Some(lack));
         assert!(tuned.tunes.iter().all(|tune| tune.pull().unwrap().abs() < 3.0), "{:?}", tuned.tunes);
     }

@@ -4,7 +4,7 @@
 
 use std::path::{Path, PathBuf};
 
-use inference::{BatchFit, Campaign, Recording, TuneUse};
+use inference::{BaseModel, BatchFit, Campaign, Recording, TuneUse};
 use nalgebra::{DMatrix, DVector};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
@@ -128,7 +128,7 @@ fn trims_and_effective_currents_give_one_answer() {
     let fits = [effective, with_trims(&frames)].map(|frames| {
         let recording = Recording::parse(&folder, &ring, &header, &frames).unwrap();
         let campaign = Campaign::of(&ring, &recording).unwrap();
-        BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap()
+        BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap()
     });
     let apart = fits[0].map_params.iter().zip(&fits[1].map_params).map(|(one, other)| (one - other).abs());
     assert!(apart.fold(0.0, f64::max) < 1e-6);
@@ -204,7 +204,7 @@ fn scatter_of_idle_correctors_takes_no_frame_away() {
             let what = format!("{name}, {ampere} A, {}", if follows { "followed" } else { "read back alone" });
             let recording = scattered(&ring, &given, &truth, ampere, follows, seed);
             let campaign = Campaign::of(&ring, &recording).unwrap();
-            let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+            let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
             println!("{what}: {} settings, share {:.2}", campaign.settings.count(), campaign.followed);
             assert_sound(&format!("fit of {what}"), fit.chi2_per_dof, nees(&fit, &truth));
         }

@@ -7,8 +7,8 @@ use inference::recording::Row;
 use inference::simulate::{self, Hardware};
 use inference::stream::{self, Core, Walk};
 use inference::{
-    BatchFit, Campaign, Drive, Estimate, Posterior, Readings, Recording, RecordingError, Reduced, ResponseModel,
-    TuneUse,
+    BaseModel, BatchFit, Campaign, Drive, Estimate, Posterior, Readings, Recording, RecordingError, Reduced,
+    ResponseModel, TuneUse,
 };
 use nalgebra::{DMatrix, DVector};
 use rand::rngs::StdRng;
@@ -240,7 +240,7 @@ impl Fitted {
             core: last.iter().map(|theta| f64::from(*theta)).collect(),
             covariance: DMatrix::from_fn(48, 48, |i, j| f64::from(core.covariance(i, j))),
             chi2: f64::from(quality.chi_square / quality.degrees_of_freedom),
-            batch: BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap(),
+            batch: BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap(),
         }
     }
 
@@ -339,7 +339,7 @@ fn one_baseline_for_all_times_would_not_do() {
         let truth = Truth { apart, off: 0.0, ..Truth::of(&ring, 12) };
         let mut recording = campaign(&truth);
         let all = Campaign::of(&plain, &as_at_one_time(recording.clone())).unwrap();
-        let all = BatchFit::best(&all, TuneUse::Readings, |_| ()).unwrap();
+        let all = BatchFit::best(&all, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
         println!("{apart} m apart, all: chi2/dof {:.3}, mismatch {}", all.chi2_per_dof, all.mismatch);
         let is_up = |row: &Row| row.correctors.iter().any(|(_, setting)| *setting > 0.0);
         recording.rows.retain(|row| row.cycle_time == if is_up(row) { 0.05 } else { 0.11 });
@@ -363,7 +363,7 @@ fn the_sampled_density_is_that_of_the_batch_fit() {
     for (off, most) in [(0.0, 0.01), (1.0 / 3.0, 0.1)] {
         let recording = campaign(&Truth { off, ..Truth::of(&ring, 12) });
         let campaign = Campaign::of(&ring, &through_files(&recording, &ring).unwrap()).unwrap();
-        let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
         let reduced = Reduced::from_fit(campaign, fit).unwrap();
         let model = ResponseModel::twin(&reduced.campaign.ring).unwrap();
         let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);

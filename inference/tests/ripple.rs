@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use inference::simulate::{self, Hardware, Truth};
-use inference::{BatchFit, Campaign, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::{BaseModel, BatchFit, Campaign, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
 use nalgebra::DVector;
 use twin::{Hold, Optics, Ring};
 
@@ -40,9 +40,9 @@ fn baselines_follow_the_supplies() {
     let mut sum = 0.0;
     for (seed, tune) in MACHINES {
         let (mut campaign, vars) = campaign(seed, tune);
-        let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
         campaign.ripple.iter_mut().for_each(|sigma| *sigma = [0.0; 2]);
-        let steady = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let steady = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
         let (ours, theirs) = (nees(&fit, &vars), nees(&steady, &vars));
         println!(
             "{seed}: tune {tune}, chi2/dof {:.4}, steady {:.4}, NEES/48 {ours:.2}, steady {theirs:.2}",
@@ -62,7 +62,7 @@ fn baselines_follow_the_supplies() {
 fn the_density_and_the_fit_take_the_same_terms_out() {
     let (seed, tune) = MACHINES[0];
     let (campaign, _) = campaign(seed, tune);
-    let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
     let reduced = Reduced::from_fit(campaign, fit).unwrap();
     let model = ResponseModel::twin(&reduced.campaign.ring).unwrap();
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);

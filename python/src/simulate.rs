@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use diagnosis::DataError;
 use inference::simulate::{self as simulated, Hardware, Instruments, Truth};
-use inference::{BatchFit, TuneUse};
+use inference::{BaseModel, BatchFit, TuneUse};
 use pyo3::prelude::*;
 use results::{CommandError, campaign, factors};
 use validation::{Cases, Class};
@@ -61,7 +61,7 @@ pub fn marginals(py: Python<'_>, ring: &Ring, recording: &Recording) -> PyResult
     let frames = recording.frames_of(&ring.ring)?;
     py.detach(|| {
         let campaign = campaign(&ring.ring, frames).map_err(raised)?;
-        let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).map_err(other)?;
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).map_err(other)?;
         Ok((fit.marginals.iter().map(|one| one.mean).collect(), fit.marginals.iter().map(|one| one.sigma).collect()))
     })
 }

@@ -1,6 +1,6 @@
 //! What changed between two measurements of one machine: the result of `orbitcal compare`.
 
-use inference::{BatchFit, Recording, TuneUse};
+use inference::{BaseModel, BatchFit, Recording, TuneUse};
 use measured::departure::clear;
 use measured::{Before, Folder, Settings};
 use twin::Ring;
@@ -48,7 +48,7 @@ pub fn compare_recordings(
 ) -> Result<Comparison, CommandError> {
     let mut vars = |recording: &Recording| -> Result<_, CommandError> {
         let campaign = campaign(ring, recording)?;
-        let fit = BatchFit::best(&campaign, TuneUse::Readings, &mut progress)?;
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, &mut progress)?;
         Ok(FitResult::of_fit(&campaign, &fit).vars)
     };
     let (before, after) = (vars(before)?, vars(after)?);

@@ -3,7 +3,7 @@
 use core::fmt;
 
 use comfy_table::ColumnConstraint;
-use diagnosis::{Diagnosis, Finding, Fitted, Imperfection, Measure, OutOfRange, Score, Vars};
+use diagnosis::{Diagnosis, Finding, Fitted, OutOfRange, Score, Vars};
 use inference::Recording;
 use report::Page;
 use schemars::JsonSchema;
@@ -13,6 +13,7 @@ use twin::{Measured, Ring};
 use crate::diagnosis_page::page;
 use crate::error::CommandError;
 use crate::fit_result::{Monitor, Tunes, TunesMeasured, Var, monitors, vars_of};
+use crate::imperfection::ImperfectionResult;
 use crate::output::{fill, table};
 
 /// What is missing. Field names are those of the command's JSON.
@@ -132,33 +133,6 @@ struct Probabilities {
     nothing_more: f64,
     library: f64,
     unknown: f64,
-}
-
-#[derive(Debug, Serialize, JsonSchema)]
-struct ImperfectionResult {
-    kind: &'static str,
-    at: String,
-    /// What the members have in common, in the unit.
-    mean: f64,
-    /// Rms of the members about it.
-    scatter: f64,
-    /// Standard deviation of whichever of the two is not 0.
-    sigma: f64,
-    unit: &'static str,
-    #[serde(skip)]
-    row: Option<[String; 4]>,
-}
-
-impl From<&Imperfection> for ImperfectionResult {
-    fn from(one: &Imperfection) -> Self {
-        let Imperfection { kind, measure, measured, unit, .. } = *one;
-        let [mean, scatter] = match measure {
-            Measure::Mean => [measured.value, 0.0],
-            Measure::Scatter => [0.0, measured.value],
-        };
-        let row = one.is_seen().then(|| one.row());
-        Self { kind, at: one.at.clone(), mean, scatter, sigma: measured.sigma, unit: unit.symbol, row }
-    }
 }
 
 /// The page of a diagnosis.

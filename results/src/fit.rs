@@ -1,10 +1,13 @@
 //! The batch fit of a recording, by Gauss-Newton or by NUTS: the result of `orbitcal fit`, and its page.
 
+use core::fmt::Display;
 use core::ops::ControlFlow;
 use std::sync::Arc;
 
 use inference::nuts::{self, NutsError, NutsRun, NutsSettings};
-use inference::{BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::{
+    BaseModel, BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse,
+};
 use report::Page;
 use twin::Ring;
 
@@ -31,8 +34,9 @@ pub enum FitModel {
 /// # Errors
 /// [`CommandError::Other`] where the design or the calibrated ring has no stable motion.
 pub fn fit_page(ring: &Ring, recording: &Recording, result: &FitResult) -> Result<Page, CommandError> {
-    let made = page(&recording.powered(ring), &recording.mean_supplies(), result);
-    made.map_err(|error| CommandError::Other(format!("{}: {error}", recording.name)))
+    let failed = |error: &dyn Display| CommandError::Other(format!("{}: {error}", recording.name));
+    let made = page(&recording.powered(ring), result).map_err(|error| failed(&error))?;
+    made.ok_or_else(|| failed(&"the ring as fitted has no stable motion"))
 }
 
 /// Damped Gauss-Newton on the twin; `progress` hears the number of each step.
@@ -46,7 +50,7 @@ pub fn fit_by_steps(
 ) -> Result<FitResult, CommandError> {
     let (campaign, fit) = fitted(ring, recording, progress)?;
     let notes = vec![format!("{} Gauss-Newton steps", fit.steps)];
-    let result = FitResult::of_fit(&campaign, &fit).with_optics(&campaign.ring, &campaign.supplies);
+    let result = FitResult::of_fit(&campaign, &fit);
     Ok(FitResult { notes, ..result })
 }
 
@@ -57,7 +61,7 @@ fn fitted(
     progress: impl FnMut(usize),
 ) -> Result<(Campaign, BatchFit), CommandError> {
     let campaign = campaign(ring, recording)?;
-    let fit = BatchFit::best(&campaign, TuneUse::Readings, progress)?;
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::UNCERTAIN, progress)?;
     Ok((campaign, fit))
 }
 
@@ -96,7 +100,6 @@ pub fn fit_by_draws(
         _ => failed(error.to_string()),
     })?;
     let result = FitResult::of_draws(&reduced, word, &run);
-    let result = result.with_optics(&reduced.campaign.ring, &reduced.campaign.supplies);
     let extrapolated = is_network.then(|| outside(&posterior, &run));
     Ok((FitResult { notes: notes(&run), extrapolated, ..result }, run.draws))
 }

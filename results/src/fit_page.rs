@@ -4,6 +4,7 @@
 
 use core::f64::consts::TAU;
 
+use inference::FittedOptics;
 use report::{Axes, Band, Figure, Page, Reference, Section, Series, Table};
 use twin::{CalibratedOptics, Hold, Optics, OrbitError, Ring, Tunes, Twiss};
 
@@ -19,17 +20,18 @@ struct Calibrated<'r> {
     /// Path length [m].
     s: Vec<f64>,
     design: (Vec<Twiss>, Tunes),
-    optics: CalibratedOptics,
-    sigma: (Vec<Twiss>, Tunes),
+    optics: &'r CalibratedOptics,
+    sigma: &'r (Vec<Twiss>, Tunes),
 }
 
-/// The report, at `ln` of the supplies' factors [F] at which the tunes were measured.
+/// The report, at the mean supplies of the recording; none of a result without optics.
 ///
 /// # Errors
-/// [`OrbitError`] where the design or the calibrated ring has no stable motion.
-pub fn page(ring: &Ring, supplies: &[f64], result: &FitResult) -> Result<Page, OrbitError> {
-    let calibrated = Calibrated::of(ring, supplies, result)?;
-    Ok(Page {
+/// [`OrbitError`] where the design has no stable motion.
+pub fn page(ring: &Ring, result: &FitResult) -> Result<Option<Page>, OrbitError> {
+    let Some(fitted) = &result.calibrated else { return Ok(None) };
+    let calibrated = Calibrated::of(ring, fitted, result)?;
+    Ok(Some(Page {
         title: format!("{}: optics from {}", ring.name, result.recording),
         lead: calibrated.lead(),
         sections: vec![
@@ -40,12 +42,12 @@ pub fn page(ring: &Ring, supplies: &[f64], result: &FitResult) -> Result<Page, O
             strengths(result),
             calibrated.monitors(),
         ],
-    })
+    }))
 }
 
 impl<'r> Calibrated<'r> {
-    fn of(ring: &'r Ring, supplies: &[f64], result: &'r FitResult) -> Result<Self, OrbitError> {
-        let (optics, sigma) = result.calibrated_optics(ring, supplies)?;
+    fn of(ring: &'r Ring, fitted: &'r FittedOptics, result: &'r FitResult) -> Result<Self, OrbitError> {
+        let (optics, sigma) = fitted;
         let design = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let design = (design.twiss()?, design.tunes()?);
         let s = ring.elements.iter().map(|element| element.s).chain([ring.circumference]).collect();

@@ -10,12 +10,11 @@ use std::borrow::Cow;
 use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
 use inference::nuts::{NutsRun, UNMIXED};
-use inference::{BatchFit, Campaign, Lack, Prior, Recording, Reduced, Summary};
-use nalgebra::DMatrix;
+use inference::{BatchFit, Campaign, FittedOptics, Lack, Prior, Recording, Reduced, Summary};
 use schemars::JsonSchema;
 use serde::Serialize;
 use studies::Sampled;
-use twin::{CalibratedOptics, OrbitError, Ring, Twiss};
+use twin::Ring;
 
 pub use monitor::{Monitor, faults, monitors, state_word};
 pub use tunes::{TuneMeasured, Tunes, TunesMeasured};
@@ -23,6 +22,7 @@ use tunes::{measured, tunes};
 use var::covariance;
 pub use var::{Var, vars_of};
 
+use crate::imperfection::ImperfectionResult;
 use crate::optics::{OpticsAt, optics_at, places};
 use crate::output::{fill, table};
 use crate::record::{EstimateRecord, Remarked};
@@ -57,6 +57,9 @@ pub struct FitResult {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lack: Option<String>,
     pub monitors: Vec<Monitor>,
+    /// What the design may be off by throughout the ring, of a batch fit.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub imperfections: Vec<ImperfectionResult>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log_evidence: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -66,6 +69,9 @@ pub struct FitResult {
     /// Share of the frames that were predicted outside the range that the model was made for; only of a model that has one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub extrapolated: Option<f64>,
+    /// The optics at every element, of a batch fit.
+    #[serde(skip)]
+    pub calibrated: Option<FittedOptics>,
     /// How it was found, for a person.
     #[serde(skip)]
     pub notes: Vec<String>,
@@ -161,6 +167,8 @@ impl FitResult {
                 .then(|| f64::from(quality.chi_square / quality.degrees_of_freedom)),
             mismatch: quality.is_mismatch(),
             monitors: last.monitors(),
+            calibrated: None,
+            imperfections: Vec::new(),
             optics: Vec::new(),
             log_evidence: Some(f64::from(last.log_evidence)),
             timing: Some(timing),
@@ -193,16 +201,18 @@ impl FitResult {
             method: "nuts",
             model,
             covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
-            tunes: tunes(&reduced.campaign.ring, &vars, &reduced.campaign.supplies),
             vars,
             nuts: Some(Sampling::of(&sampled, run)),
             ..Self::of_both(&reduced.campaign, &reduced.fit)
         }
     }
 
-    /// What the batch fit says and the draws leave as it is.
+    /// What the batch fit says and the draws leave as it is; without optics where the ring as fitted is unstable.
     fn of_both(campaign: &Campaign, fit: &BatchFit) -> Self {
-        let [x, y] = &fit.tunes;
+        let ([x, y], ring) = (&fit.tunes, &campaign.ring);
+        let calibrated = fit.optics(campaign).ok();
+        let sigma = calibrated.as_ref().map(|(_, (_, tunes))| *tunes);
+        let of_places = |(optics, (sigma, _)): &FittedOptics| optics_at(ring, &places(ring), &optics.twiss, sigma);
         Self {
             recording: campaign.recording.name.clone(),
             method: "",
@@ -214,43 +224,19 @@ impl FitResult {
             covariance: Vec::new(),
             chi2_per_dof: Some(fit.chi2_per_dof).filter(|chi2| chi2.is_finite()),
             mismatch: fit.mismatch,
-            tunes: Some(Tunes { x: x.model, y: y.model, sigma: None }),
+            tunes: Some(Tunes::of_fit([x.model, y.model], sigma)),
             tunes_measured: TunesMeasured { x: measured(x), y: measured(y) },
-            optics: Vec::new(),
+            optics: calibrated.as_ref().map(of_places).unwrap_or_default(),
+            calibrated,
             lack: fit.lack.map(|lack| lack.to_string()),
             monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
+            imperfections: fit.base.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect(),
             log_evidence: None,
             timing: None,
             nuts: None,
             extrapolated: None,
             notes: Vec::new(),
         }
-    }
-
-    /// With the optics that follow from the vars, at `ln` of the supplies' factors [F]; as it is where that ring is unstable.
-    pub(crate) fn with_optics(self, ring: &Ring, supplies: &[f64]) -> Self {
-        let Ok((optics, (sigma, of_tunes))) = self.calibrated_optics(ring, supplies) else { return self };
-        let optics_of_places = optics_at(ring, &places(ring), &optics.twiss, &sigma);
-        Self { tunes: Some(Tunes::with_sigma([optics.tunes, of_tunes])), optics: optics_of_places, ..self }
-    }
-
-    /// The optics that follow from the vars and their standard deviations: the covariance of the vars carried through the derivatives,
-    /// `sigma^2 = J C J^T`.
-    ///
-    /// # Errors
-    /// [`OrbitError`] of unstable motion.
-    pub(crate) fn calibrated_optics(
-        &self,
-        ring: &Ring,
-        supplies: &[f64],
-    ) -> Result<(CalibratedOptics, (Vec<Twiss>, twin::Tunes)), OrbitError> {
-        let means: Vec<f64> = self.vars.iter().map(|var| var.mean).collect();
-        let params: Vec<f64> = means.iter().map(|mean| mean.ln()).collect();
-        let optics = CalibratedOptics::of(ring, &params, supplies)?;
-        // self.covariance is that of the factors
-        let of_params = |i: usize, j: usize| self.covariance[i][j] / (means[i] * means[j]);
-        let sigma = optics.sigma(&DMatrix::from_fn(means.len(), means.len(), of_params));
-        Ok((optics, sigma))
     }
 
     /// One var a row, or two where their names are short enough for 80 columns.
@@ -279,7 +265,9 @@ impl FitResult {
     /// What a reader has to know before using the numbers.
     fn remarks(&self) -> Vec<String> {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
+        let seen: Vec<&str> = self.imperfections.iter().filter_map(|one| one.said.as_deref()).collect();
         let remarks = [
+            (!seen.is_empty()).then(|| format!("the design is off by: {}", seen.join(", "))),
             self.lack.as_ref().map(|lack| format!("{lack}: the result is the prior, but for measured tunes")),
             self.tunes.and_then(|tunes| self.tunes_measured.remark(&tunes)),
             (!clipped.is_empty()).then(|| format!("* at a bound of the prior's range: {}", clipped.join(", "))),

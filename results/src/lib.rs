@@ -29,6 +29,7 @@ mod fit;
 mod fit_page;
 mod fit_result;
 mod frames_result;
+mod imperfection;
 mod import_result;
 mod matrix;
 mod matrix_diagnosis;

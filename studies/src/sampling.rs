@@ -9,7 +9,9 @@ use twin::Ring;
 
 use inference::Campaign;
 use inference::nuts::{self, NutsSettings};
-use inference::{BatchFit, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse, Width, simulate};
+use inference::{
+    BaseModel, BatchFit, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse, Width, simulate,
+};
 use report::{Section, Table};
 
 use super::{Sampled, StudyError};
@@ -126,7 +128,7 @@ pub(crate) fn reduced(ring: &Ring, recording: &Recording) -> Result<Reduced, Stu
     if campaign.times.count() > 1 {
         return Err(StudyError::Times(campaign.times.to_string()));
     }
-    let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ())?;
+    let fit = BatchFit::best(&campaign, TuneUse::LeftOut, BaseModel::EXACT, |_| ())?;
     Ok(Reduced::from_fit(campaign, fit)?)
 }
 

@@ -3,7 +3,7 @@
 
 use diagnosis::{Diagnosis, Verdict};
 use estimator::Walk;
-use inference::{BatchFit, Campaign, Recording, TuneUse, simulate, stream};
+use inference::{BaseModel, BatchFit, Campaign, Recording, TuneUse, simulate, stream};
 use system_tests::{cells, repository};
 use twin::{Effect, EffectKind, Ring};
 use validation::{Grade, Truth};
@@ -38,7 +38,7 @@ fn stream_and_batch_fit_find_the_true_vars() {
     for (folder, name) in [("ten-cells", "plain"), ("three-families", "campaign")] {
         let (ring, recording, truth) = read(folder, name);
         let campaign = Campaign::of(&ring, &recording).unwrap();
-        let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+        let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
         let of_fit = |i: usize| (fit.map_params[i], fit.covariance[(i, i)].sqrt());
         assert_sound(folder, fit.chi2_per_dof, pull(&ring, &truth, of_fit));
         let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();

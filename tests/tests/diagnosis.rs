@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Imperfection, Measure, Term, Verdict, candidates, sample, scan};
+use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Term, Verdict, candidates, sample, scan};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
 use inference::{Campaign, Recording};

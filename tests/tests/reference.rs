@@ -7,7 +7,9 @@ use estimator::{Marginal, Walk};
 use inference::nuts::{self, NutsRun, NutsSettings};
 use inference::simulate::{self, Instruments};
 use inference::stream::{self, Core};
-use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse, Width};
+use inference::{
+    BaseModel, BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse, Width,
+};
 use nalgebra::DMatrix;
 use studies::{self, Kind, Options, Sampled, Subset};
 use system_tests::repository;
@@ -21,7 +23,7 @@ fn read(name: &str) -> (Ring, Recording) {
 
 fn reduced(ring: &Ring, recording: &Recording) -> Reduced {
     let campaign = Campaign::of(ring, recording).unwrap();
-    let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ()).unwrap();
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
     Reduced::from_fit(campaign, fit).unwrap()
 }
 

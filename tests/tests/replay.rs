@@ -3,7 +3,7 @@
 
 use estimator::Walk;
 use inference::stream::{self, Core, Estimate, Setup};
-use inference::{BatchFit, Campaign, Recording, TuneUse};
+use inference::{BaseModel, BatchFit, Campaign, Recording, TuneUse};
 use system_tests::machine::nees;
 use system_tests::{repository, truth};
 use twin::Ring;
@@ -103,7 +103,13 @@ fn faulty_monitors_are_found_and_the_others_left_alone() {
 fn the_core_agrees_with_the_exact_batch_fit() {
     for name in ["paper-vars", "random-vars"] {
         let mut run = replay(read(name));
-        let fit = BatchFit::best(&Campaign::of(&run.ring, &run.recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
+        let fit = BatchFit::best(
+            &Campaign::of(&run.ring, &run.recording).unwrap(),
+            TuneUse::Readings,
+            BaseModel::EXACT,
+            |_| (),
+        )
+        .unwrap();
         for i in 0..48 {
             let sigma = fit.covariance[(i, i)].sqrt();
             let shift = (f64::from(run.last.map_params[i]) - fit.map_params[i]) / sigma;

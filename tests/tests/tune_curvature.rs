@@ -3,7 +3,7 @@
 
 use core::f64::consts::{PI, TAU};
 
-use inference::{BatchFit, Campaign, Recording, TuneUse};
+use inference::{BaseModel, BatchFit, Campaign, Recording, TuneUse};
 use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
@@ -58,7 +58,9 @@ fn the_second_order_of_a_tune_is_as_stated() {
     let ring = Ring::booster();
     for name in ["paper-vars", "random-vars"] {
         let recording = Recording::read(&repository("recordings").join(name), &ring).unwrap();
-        let fit = BatchFit::best(&Campaign::of(&ring, &recording).unwrap(), TuneUse::Readings, |_| ()).unwrap();
+        let fit =
+            BatchFit::best(&Campaign::of(&ring, &recording).unwrap(), TuneUse::Readings, BaseModel::EXACT, |_| ())
+                .unwrap();
         let at = DVector::from_fn(48, |i, _| fit.map_params[i]);
         let covariance = DMatrix::from_fn(48, 48, |i, j| fit.covariance[(i, j)]);
         let slopes = slopes(&ring, &at);

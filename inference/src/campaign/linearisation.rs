@@ -1,9 +1,12 @@
 //! The exact ring at given params and mean supplies, and to first order about them: what predictions of frames are made of.
+//!
+//! The params are the vars, and after them the amplitudes of the base model's terms ([`BaseModel`]), if it has any.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, Vector2};
 use twin::{ClosedOrbit, Hold, Machine, Optics, OrbitError, Plane, Ring, Tunes};
 
 use super::times::Times;
+use crate::base_model::BaseModel;
 use crate::recording::{Drive, mean_supplies};
 
 /// The ring at given params.
@@ -11,7 +14,7 @@ use crate::recording::{Drive, mean_supplies};
 pub(crate) struct Linearised {
     /// Response of the read monitors to the correctors [B][C] [m/rad].
     response: DMatrix<f64>,
-    /// Its derivative with respect to each param, of each monitor [N][C].
+    /// Its derivative with respect to each param, of each monitor [N + K][C].
     slopes: Vec<DMatrix<f64>>,
     /// The same with respect to `ln` of each supply's strength, a matrix [B][C] for each supply.
     supply_slopes: Vec<DMatrix<f64>>,
@@ -38,7 +41,7 @@ pub(crate) struct AtTimes {
 impl AtTimes {
     /// About params, at the mean supplies of all frames and of those of each time.
     pub fn new(
-        machine: &Machine,
+        (machine, base): (&Machine, BaseModel),
         params: &DVector<f64>,
         supplies: &[f64],
         drives: &[Drive],
@@ -47,12 +50,12 @@ impl AtTimes {
         let at_time = |time: usize| {
             let frames: Vec<usize> = (0..drives.len()).filter(|&i| times.of_frame[i] == time).collect();
             let drives = drives_of(drives, &frames);
-            let linearised = Linearised::about(machine, params, &mean_supplies(&drives), &drives)?;
+            let linearised = Linearised::about((machine, base), params, &mean_supplies(&drives), &drives)?;
             Ok((frames, linearised))
         };
         let several = if times.count() > 1 { times.count() } else { 0 };
         let each = (0..several).map(at_time).collect::<Result<_, OrbitError>>()?;
-        Ok(Self { at_mean: Linearised::about(machine, params, supplies, drives)?, each })
+        Ok(Self { at_mean: Linearised::about((machine, base), params, supplies, drives)?, each })
     }
 
     /// As [`Linearised::orbits`].
@@ -96,25 +99,29 @@ impl Linearised {
     /// About params and supplies, for the RF offsets of some frames. Kicks move the beam with what the machine holds constant; an RF
     /// offset overrides that.
     pub fn about(
-        machine: &Machine,
+        (machine, base): (&Machine, BaseModel),
         params: &DVector<f64>,
         supplies: &[f64],
         drives: &[Drive],
     ) -> Result<Self, OrbitError> {
-        let ring = &machine.ring().with_strengths(&machine.ring().strengths(params.as_slice(), supplies));
+        let vars = machine.ring().parameters.len();
+        let amplitudes = &params.as_slice()[vars..];
+        let design = machine.ring().with_strengths(&machine.ring().strengths(params.as_slice(), supplies));
+        let ring = &base.ring(&design, amplitudes);
         let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let held = machine.held_of(ring, &optics)?;
         let (observers, sources, gradients) = (optics.read_monitors(), optics.correctors(), optics.quadrupoles());
+        let (kicks, rf_factor) = (base.kick_factors(ring, amplitudes), base.rf_factor(amplitudes));
         let k1 = ring.gradients();
         let by_param = |m: usize| ring.quadrupoles[m].parameter;
         let by_supply = |m: usize| ring.quadrupoles[m].supply;
-        let (params, supply_count) = (ring.parameters.len(), ring.supplies.len());
+        let supply_count = ring.supplies.len();
         let (monitors, correctors) = (observers.len(), sources.len());
-        let mut slopes = vec![DMatrix::zeros(params, correctors); monitors];
+        let mut slopes = vec![DMatrix::zeros(params.len(), correctors); monitors];
         let mut supply_slopes = vec![DMatrix::zeros(monitors, correctors); supply_count];
         // d/d ln k = k1 d/dk1
         for (m, gradient) in gradients.iter().enumerate() {
-            let slope = held.jacobian(&optics, &observers, &sources, gradient) * k1[m];
+            let slope = scaled(held.jacobian(&optics, &observers, &sources, gradient) * k1[m], &kicks);
             if let Some(param) = by_param(m) {
                 for (of_monitor, slope) in slopes.iter_mut().zip(slope.row_iter()) {
                     let mut row = of_monitor.row_mut(param);
@@ -125,7 +132,7 @@ impl Linearised {
                 supply_slopes[supply] += slope;
             }
         }
-        let rf_slope = optics.rf_jacobian(&observers, &gradients);
+        let rf_slope = optics.rf_jacobian(&observers, &gradients) * rf_factor;
         let tune_slope: Vec<[f64; 2]> = gradients.iter().map(|gradient| optics.tune_slope(gradient)).collect();
         let tune_slope = DMatrix::from_fn(2, gradients.len(), |plane, m| tune_slope[m][plane]);
         let summed = |slope: &DMatrix<f64>, count: usize, index: &dyn Fn(usize) -> Option<usize>| {
@@ -138,21 +145,47 @@ impl Linearised {
             sum
         };
         let (rf_params, rf_supplies) =
-            (summed(&rf_slope, params, &by_param), summed(&rf_slope, supply_count, &by_supply));
-        let rf = |offset: f64| {
-            let orbit = rf_orbit(ring, offset)?;
-            Ok(RfOrbit { offset, orbit, slopes: rf_params.transpose() * offset, supply_slopes: &rf_supplies * offset })
+            (summed(&rf_slope, params.len(), &by_param), summed(&rf_slope, supply_count, &by_supply));
+        let offsets = offsets(drives);
+        let here = Seen::of(&(machine, base), &design, amplitudes, &offsets)?;
+        let rf = |(&offset, orbit): (&f64, &DVector<f64>)| RfOrbit {
+            offset,
+            orbit: orbit.clone(),
+            slopes: rf_params.transpose() * offset,
+            supply_slopes: &rf_supplies * offset,
         };
-        Ok(Self {
-            response: held.response(&optics, &observers, &sources),
+        let mut linearised = Self {
+            rf: offsets.iter().zip(&here.rf).map(rf).collect(),
+            response: here.response.clone(),
             slopes,
             supply_slopes,
-            rf: offsets(drives).into_iter().map(rf).collect::<Result<_, OrbitError>>()?,
-            tunes: optics.tunes()?,
-            tune_slopes: summed(&tune_slope, params, &by_param),
+            tunes: here.tunes,
+            tune_slopes: summed(&tune_slope, params.len(), &by_param),
             tune_supply_slopes: summed(&tune_slope, supply_count, &by_supply),
             supplies: DVector::from_column_slice(supplies),
-        })
+        };
+        for (at, term) in base.terms().iter().enumerate() {
+            let mut amplitudes = amplitudes.to_vec();
+            amplitudes[at] += term.step();
+            let there = Seen::of(&(machine, base), &design, &amplitudes, &offsets)?;
+            linearised.set_slope(vars + at, &there.slope_from(&here, term.step()));
+        }
+        Ok(linearised)
+    }
+
+    /// Derivatives of the response [B][C + 1], that to the RF offset in its last column [m], and of both tunes, with respect to one param.
+    pub fn slope(&self, param: usize) -> (DMatrix<f64>, Vector2<f64>) {
+        let (monitors, correctors) = self.response.shape();
+        let of_rf = |b: usize| self.rf.first().map_or(0.0, |rf| rf.slopes[(param, b)] / rf.offset);
+        let element = |b: usize, c: usize| if c < correctors { self.slopes[b][(param, c)] } else { of_rf(b) };
+        (DMatrix::from_fn(monitors, correctors + 1, element), self.tune_slopes.fixed_rows::<2>(0).column(param).into())
+    }
+
+    /// The derivatives with respect to one param.
+    fn set_slope(&mut self, param: usize, slope: &Seen) {
+        self.slopes.iter_mut().zip(slope.response.row_iter()).for_each(|(to, row)| to.set_row(param, &row));
+        self.rf.iter_mut().zip(&slope.rf).for_each(|(to, orbit)| to.slopes.set_row(param, &orbit.transpose()));
+        self.tune_slopes.set_column(param, &Vector2::new(slope.tunes.x, slope.tunes.y));
     }
 
     /// Orbits of frames without baselines, the supplies off their mean to first order: rows frames, columns monitors [m].
@@ -194,6 +227,50 @@ impl Linearised {
     fn kicks(&self, drives: &[Drive]) -> DMatrix<f64> {
         columns(self.response.ncols(), drives, |drive| drive.kick.clone())
     }
+}
+
+/// What frames see of a ring, or its derivative with respect to a term of the base model.
+struct Seen {
+    /// Response of the read monitors to the correctors [B][C] [m/rad].
+    response: DMatrix<f64>,
+    /// Orbit of each RF offset [B] [m].
+    rf: Vec<DVector<f64>>,
+    tunes: Tunes,
+}
+
+impl Seen {
+    /// Of a design with amplitudes of the base model's terms.
+    fn of(
+        (machine, base): &(&Machine, BaseModel),
+        design: &Ring,
+        amplitudes: &[f64],
+        offsets: &[f64],
+    ) -> Result<Self, OrbitError> {
+        let ring = &base.ring(design, amplitudes);
+        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
+        let response = machine.held_of(ring, &optics)?.response(&optics, &optics.read_monitors(), &optics.correctors());
+        let rf = |offset: &f64| Ok(rf_orbit(ring, *offset)? * base.rf_factor(amplitudes));
+        Ok(Self {
+            response: scaled(response, &base.kick_factors(ring, amplitudes)),
+            rf: offsets.iter().map(rf).collect::<Result<_, OrbitError>>()?,
+            tunes: optics.tunes()?,
+        })
+    }
+
+    /// The derivative, from what is seen a step away.
+    fn slope_from(self, here: &Self, step: f64) -> Self {
+        Self {
+            response: (self.response - &here.response) / step,
+            rf: self.rf.iter().zip(&here.rf).map(|(there, here)| (there - here) / step).collect(),
+            tunes: Tunes { x: (self.tunes.x - here.tunes.x) / step, y: (self.tunes.y - here.tunes.y) / step },
+        }
+    }
+}
+
+/// A response [B][C] with a factor on each corrector.
+fn scaled(mut response: DMatrix<f64>, factors: &DVector<f64>) -> DMatrix<f64> {
+    response.column_iter_mut().zip(factors.iter()).for_each(|(mut column, factor)| column *= *factor);
+    response
 }
 
 /// Columns of all frames.

@@ -19,6 +19,7 @@ use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Hold, Machine, Optics, OrbitError, Ring, SHARED, ripple_of_misaligned, spurious_dispersion};
 
+use crate::base_model::BaseModel;
 use crate::prior::Prior;
 use crate::recording::{self, Drive, Recording};
 
@@ -250,12 +251,12 @@ impl Campaign {
         terms
     }
 
-    /// Linearised about params, at the supplies of each time in the cycle.
+    /// Linearised about params and, after them, amplitudes of a base model, at the supplies of each time in the cycle.
     ///
     /// # Errors
     /// [`OrbitError`] if there is no stable ring.
-    pub(crate) fn linearised(&self, params: &DVector<f64>) -> Result<AtTimes, OrbitError> {
-        AtTimes::new(&self.held, params, &self.supplies, &self.drives, &self.times)
+    pub(crate) fn linearised(&self, base: BaseModel, params: &DVector<f64>) -> Result<AtTimes, OrbitError> {
+        AtTimes::new((&self.held, base), params, &self.supplies, &self.drives, &self.times)
     }
 
     /// Rms of the baselines that are known, in x and y [m].

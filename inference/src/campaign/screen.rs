@@ -18,6 +18,7 @@ use super::linearisation::Linearised;
 use super::normal_equations::{Normal, Terms};
 use super::setting::Settings;
 use super::times::Times;
+use crate::base_model::BaseModel;
 use crate::prior::Prior;
 use crate::recording::{self, Drive};
 use evidence::Factor;
@@ -186,7 +187,7 @@ impl Screener<'_> {
         let mut tried = shares.map(|share| {
             let step = &best.step * share;
             let (params, baselines) = (&model.params + &step, normal.baselines(&step));
-            let linearised = Linearised::about(self.held, &params, self.supplies, self.drives)?;
+            let linearised = Linearised::about((self.held, BaseModel::EXACT), &params, self.supplies, self.drives)?;
             Ok(Seen { screened: screened.clone(), params, linearised, baselines })
         });
         let first = tried.next().expect("there are shares");
@@ -209,7 +210,7 @@ impl Screener<'_> {
     }
 
     fn model(&self, params: DVector<f64>) -> Result<Model, OrbitError> {
-        let linearised = Linearised::about(self.held, &params, self.supplies, self.drives)?;
+        let linearised = Linearised::about((self.held, BaseModel::EXACT), &params, self.supplies, self.drives)?;
         let (orbit, slope) = (linearised.orbits(self.drives), linearised.slopes(&self.groups.drives));
         let to_mean_drive = self.to_mean_drive(&orbit);
         Ok(Model { params, orbit, slope, to_mean_drive })

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use inference::{BatchFit, TuneUse, simulate};
+use inference::{BaseModel, BatchFit, TuneUse, simulate};
 use measured::Folder;
 use results::output;
 use serde_json::{Value, json};
@@ -44,7 +44,7 @@ fn into_recording(options: &Conceal) -> Result<Value, CommandError> {
     let campaign = campaign(&ring, &given)?;
     let cases = Cases::of(&campaign).map_err(|error| CommandError::Input(error.to_string()))?;
     let effects = cases.draw(Class::Single, options.seed as usize, options.seed).effects;
-    let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ())?;
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ())?;
     let vars: Vec<f64> = fit.map_params.iter().map(|theta| theta.exp()).collect();
     let concealed = simulate::conceal(&given, &ring, &vars, &effects).map_err(CommandError::other)?;
     concealed.write(&options.out, &ring).map_err(CommandError::other)?;

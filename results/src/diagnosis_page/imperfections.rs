@@ -1,6 +1,7 @@
 //! The machine as it is.
 
-use diagnosis::{Diagnosis, Imperfection};
+use diagnosis::Diagnosis;
+use inference::Imperfection;
 use report::Section;
 
 use super::table;

@@ -36,9 +36,9 @@ pub struct TunesSigma {
 }
 
 impl Tunes {
-    /// Tunes and their standard deviations.
-    pub fn with_sigma([tunes, sigma]: [twin::Tunes; 2]) -> Self {
-        Self { sigma: Some(TunesSigma { x: sigma.x, y: sigma.y }), ..Self::from(tunes) }
+    /// Tunes of a fit and, where it has optics, their standard deviations.
+    pub fn of_fit([x, y]: [f64; 2], sigma: Option<twin::Tunes>) -> Self {
+        Self { x, y, sigma: sigma.map(|sigma| TunesSigma { x: sigma.x, y: sigma.y }) }
     }
 }
 

@@ -9,7 +9,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use inference::{BatchFit, Campaign, Laplace, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::{
+    BaseModel, BatchFit, Campaign, Laplace, Posterior, Readings, Recording, Reduced, ResponseModel, TuneUse,
+};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -57,7 +59,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let ring = Ring::booster();
     let folder = arguments.recording.clone().unwrap_or_else(|| repository("recordings/paper-vars"));
     let campaign = Campaign::of(&ring, &Recording::read(&folder, &ring)?)?;
-    let fit = BatchFit::best(&campaign, TuneUse::LeftOut, |_| ())?;
+    let fit = BatchFit::best(&campaign, TuneUse::LeftOut, BaseModel::EXACT, |_| ())?;
     let reduced = Reduced::from_fit(campaign, fit)?;
     // as `orbitcal fit --method nuts --model green` puts it together, without the tunes
     let model = ResponseModel::green(&ring)?;

@@ -2,7 +2,9 @@
 
 use core::error::Error;
 
-use inference::{BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse};
+use inference::{
+    BaseModel, BatchFit, Campaign, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse,
+};
 use nalgebra::{DMatrix, DVector};
 use twin::Ring;
 
@@ -36,7 +38,7 @@ pub fn effects(
     surrogates: &[Surrogate],
 ) -> Result<Vec<(&'static str, Effect)>, Box<dyn Error>> {
     let campaign = Campaign::of(ring, &Recording::read(&repository(recording), ring)?)?;
-    let fit = BatchFit::best(&campaign, TuneUse::Readings, |_| ())?;
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ())?;
     let reduced = Reduced::from_fit(campaign, fit)?;
     let truth = DVector::from_iterator(ring.parameters.len(), truth(recording, ring).into_iter().map(f64::ln));
     let twin = posterior(&reduced, ResponseModel::twin(&reduced.campaign.ring)?)?;

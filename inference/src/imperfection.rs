@@ -1,4 +1,4 @@
-//! What a diagnosis learnt of the machine besides missing physics: a table of its ordinary imperfections.
+//! What a fit or a diagnosis learnt of the machine besides missing physics: a table of its ordinary imperfections.
 
 use twin::{Measured, Unit};
 
