@@ -148,6 +148,11 @@ impl BaseModel {
     /// A design with the uncertainty that designs have.
     pub const UNCERTAIN: Self = Self { terms: &BaseTerm::ALL };
 
+    /// What changes the ring itself: vars imitate it.
+    pub const MAGNETS: Self = Self { terms: &[BaseTerm::DipoleGradient, BaseTerm::DipoleEdge, BaseTerm::Momentum] };
+    /// What scales kicks and RF offsets: vars cannot imitate it.
+    pub const SCALES: Self = Self { terms: &[BaseTerm::RfStep, BaseTerm::Kick(Plane::X), BaseTerm::Kick(Plane::Y)] };
+
     /// Its terms.
     pub fn terms(&self) -> &'static [BaseTerm] {
         self.terms

@@ -24,6 +24,7 @@ mod campaign;
 mod cmdstan;
 mod diagnostics;
 mod draws;
+mod imitation;
 mod imperfection;
 mod map_fit;
 mod model;
@@ -44,6 +45,7 @@ pub use campaign::{
 };
 pub use diagnostics::{mcse_sd, quantile};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
+pub use imitation::Imitation;
 pub use imperfection::{Imperfection, Measure, POSITION};
 pub use map_fit::{BatchError, BatchFit, FittedOptics, FittedTune, Lack, TuneUse};
 pub use model::{GreenModel, ResnetModel, ResponseModel};

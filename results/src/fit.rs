@@ -6,7 +6,8 @@ use std::sync::Arc;
 
 use inference::nuts::{self, NutsError, NutsRun, NutsSettings};
 use inference::{
-    BaseModel, BatchFit, Campaign, Draws, Posterior, Prior, Readings, Recording, Reduced, ResponseModel, TuneUse,
+    BaseModel, BatchFit, Campaign, Draws, Imitation, Posterior, Prior, Readings, Recording, Reduced, ResponseModel,
+    TuneUse,
 };
 use report::Page;
 use twin::Ring;
@@ -48,7 +49,7 @@ pub fn fit_by_steps(
     recording: &Recording,
     progress: impl FnMut(usize),
 ) -> Result<FitResult, CommandError> {
-    let (campaign, fit) = fitted(ring, recording, progress)?;
+    let (campaign, fit) = fitted(ring, recording, BaseModel::UNCERTAIN, progress)?;
     let notes = vec![format!("{} Gauss-Newton steps", fit.steps)];
     let result = FitResult::of_fit(&campaign, &fit);
     Ok(FitResult { notes, ..result })
@@ -58,14 +59,16 @@ pub fn fit_by_steps(
 fn fitted(
     ring: &Ring,
     recording: &Recording,
+    base: BaseModel,
     progress: impl FnMut(usize),
 ) -> Result<(Campaign, BatchFit), CommandError> {
     let campaign = campaign(ring, recording)?;
-    let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::UNCERTAIN, progress)?;
+    let fit = BatchFit::best(&campaign, TuneUse::Readings, base, progress)?;
     Ok((campaign, fit))
 }
 
-/// NUTS about the Laplace approximation; `progress` as in [`nuts::sample`].
+/// NUTS about the Laplace approximation; `progress` as in [`nuts::sample`]. The density has room for kick constants and the scale of RF steps that are off, and
+/// its draws get what vars may imitate ([`Imitation`]).
 ///
 /// # Errors
 /// [`CommandError`].
@@ -78,7 +81,8 @@ pub fn fit_by_draws(
 ) -> Result<(FitResult, Draws), CommandError> {
     expect_modelled(recording)?;
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
-    let (campaign, fit) = fitted(ring, recording, |_| ())?;
+    let imitation = Imitation::from_recording(ring, recording)?;
+    let (campaign, fit) = fitted(ring, recording, BaseModel::SCALES, |_| ())?;
     let reduced = Reduced::from_fit(campaign, fit)?;
     let ring = &reduced.campaign.ring;
     let is_network = model == FitModel::Resnet;
@@ -99,9 +103,10 @@ pub fn fit_by_draws(
         NutsError::TooMany(_) => CommandError::Input(error.to_string()),
         _ => failed(error.to_string()),
     })?;
-    let result = FitResult::of_draws(&reduced, word, &run);
+    let draws = imitation.redrawn(&run.draws, settings.seed);
+    let result = FitResult::of_draws(&reduced, word, &run, &draws);
     let extrapolated = is_network.then(|| outside(&posterior, &run));
-    Ok((FitResult { notes: notes(&run), extrapolated, ..result }, run.draws))
+    Ok((FitResult { notes: notes(&run), extrapolated, ..result }, draws))
 }
 
 /// Share of the draws outside the range that the model was made for.

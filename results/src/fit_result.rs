@@ -10,7 +10,8 @@ use std::borrow::Cow;
 use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
 use inference::nuts::{NutsRun, UNMIXED};
-use inference::{BatchFit, Campaign, FittedOptics, Lack, Prior, Recording, Reduced, Summary};
+use inference::{BatchFit, Campaign, Draws, FittedOptics, Imitation, Lack, Prior, Recording, Reduced, Summary};
+use nalgebra::{DMatrix, DVector};
 use schemars::JsonSchema;
 use serde::Serialize;
 use studies::Sampled;
@@ -134,7 +135,8 @@ fn latest(recording: &Recording) -> Cow<'_, Recording> {
 }
 
 impl FitResult {
-    /// What a core says after its last frame, here or on a device, whose params walked by so much.
+    /// What a core says after its last frame, here or on a device, whose params walked by so much; the core takes the design for exact, and here its
+    /// vars are corrected by what they may imitate ([`Imitation`]).
     pub fn of_core(
         model: &'static str,
         ring: &Ring,
@@ -144,13 +146,13 @@ impl FitResult {
         timing: Timing,
     ) -> Self {
         let prior = Prior::from_ring(ring);
-        let marginal = |i: usize| prior.marginal(i, last.centre[i].into(), last.params_sigma[i].into());
-        let marginals = (0..prior.len()).map(marginal);
+        let (centre, of_params) = corrected(ring, recording, last);
+        let marginals = (0..prior.len()).map(|i| prior.marginal(i, centre[i], of_params[(i, i)].sqrt()));
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
         // vars that walk are those of the last frames, and so are their tunes
         let seen = if walk.params > 0.0 { latest(recording) } else { Cow::Borrowed(recording) };
-        let (n, tunes) = (vars.len(), tunes(&recording.powered(ring), &vars, &seen.mean_supplies()));
+        let tunes = tunes(&recording.powered(ring), last, &seen.mean_supplies());
         Self {
             recording: recording.name.clone(),
             method: "laplace",
@@ -158,7 +160,7 @@ impl FitResult {
             frames: last.frames.saturating_sub(last.remarked.put_aside_frames) as usize,
             rejected_frames: last.rejected_frames,
             remarked: Some(last.remarked),
-            covariance: (0..n).map(|i| (0..n).map(|j| f64::from(last.covariance_of(i, j))).collect()).collect(),
+            covariance: covariance(&vars, |i, j| of_params[(i, j)]),
             tunes_measured: TunesMeasured::of_recording(&seen, tunes.map(|tunes| [tunes.x, tunes.y])),
             lack: lack(recording).map(|lack| lack.to_string()),
             tunes,
@@ -192,9 +194,9 @@ impl FitResult {
         }
     }
 
-    /// What draws of the posterior say.
-    pub fn of_draws(reduced: &Reduced, model: &'static str, run: &NutsRun) -> Self {
-        let sampled = Sampled::of(&run.draws);
+    /// What draws of the posterior say, which a run gave.
+    pub fn of_draws(reduced: &Reduced, model: &'static str, run: &NutsRun, draws: &Draws) -> Self {
+        let sampled = Sampled::of(draws);
         let vars: Vec<Var> = sampled.summary.iter().map(Var::of_draws).collect();
         let covariance = sampled.covariance();
         Self {
@@ -202,7 +204,7 @@ impl FitResult {
             model,
             covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
             vars,
-            nuts: Some(Sampling::of(&sampled, run)),
+            nuts: Some(Sampling::of(&Sampled::of(&run.draws), run)),
             ..Self::of_both(&reduced.campaign, &reduced.fit)
         }
     }
@@ -302,6 +304,21 @@ impl fmt::Display for FitResult {
         }
         self.timing.map_or(Ok(()), |timing| write!(f, "\n{timing}"))?;
         self.notes.iter().try_for_each(|note| write!(f, "\n{}", fill(note)))
+    }
+}
+
+/// Centre and covariance of each theta, with room for what the design is off by.
+fn corrected(ring: &Ring, recording: &Recording, last: &EstimateRecord) -> (DVector<f64>, DMatrix<f64>) {
+    let centre = DVector::from_iterator(last.centre.len(), last.centre.iter().copied().map(f64::from));
+    let of_params = |i: usize, j: usize| match i == j {
+        true => f64::from(last.params_sigma[i]).powi(2),
+        false => f64::from(last.covariance_of(i, j)) / f64::from(last.mean[i] * last.mean[j]),
+    };
+    let covariance = DMatrix::from_fn(centre.len(), centre.len(), of_params);
+    match Imitation::from_recording(ring, recording) {
+        Ok(imitation) => imitation.corrected(&centre, &covariance),
+        // a core of a design without a stable orbit cannot be made
+        Err(_) => (centre, covariance),
     }
 }
 

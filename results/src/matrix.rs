@@ -92,7 +92,10 @@ fn measured_of<'r>(
 fn result(Straightened { folder, cables, fit }: &Straightened, settings: &Settings) -> Result<MatrixFit, CommandError> {
     let ring = FittedRing::of(folder, fit, settings)?;
     let optics = ring.optics().map(|FittedOptics { twiss, sigma, tunes }| {
-        (Some(Tunes::of_fit([tunes[0].x, tunes[0].y], Some(tunes[1]))), optics_at(&ring.best(), &ring.places(folder), &twiss, &sigma))
+        (
+            Some(Tunes::of_fit([tunes[0].x, tunes[0].y], Some(tunes[1]))),
+            optics_at(&ring.best(), &ring.places(folder), &twiss, &sigma),
+        )
     });
     Ok(MatrixFit::of(folder, cables, fit, optics.unwrap_or_default()))
 }

@@ -9,7 +9,7 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use twin::{Hold, Optics, Ring};
 
-use super::Var;
+use crate::record::EstimateRecord;
 
 /// Standard deviations between a measured tune and the model's that noise does not explain.
 const DISAGREE: f64 = 4.0;
@@ -123,9 +123,9 @@ pub(super) fn measured(tune: &FittedTune) -> Option<TuneMeasured> {
     tune.measured.map(|(mean, sigma)| TuneMeasured { mean, sigma })
 }
 
-/// Tunes of the twin at the means and at these supplies, `ln` of their factors; none if that ring is unstable.
-pub(super) fn tunes(ring: &Ring, vars: &[Var], supplies: &[f64]) -> Option<Tunes> {
-    let params: Vec<f64> = vars.iter().map(|v| v.mean.ln()).collect();
+/// Tunes of the twin at a core's means and at these supplies, `ln` of their factors; none if that ring is unstable.
+pub(super) fn tunes(ring: &Ring, last: &EstimateRecord, supplies: &[f64]) -> Option<Tunes> {
+    let params: Vec<f64> = last.mean.iter().map(|mean| f64::from(*mean).ln()).collect();
     let ring = ring.with_strengths(&ring.strengths(&params, supplies));
     let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).ok()?.tunes().ok()?;
     Some(tunes.into())
