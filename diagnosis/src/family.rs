@@ -1,5 +1,6 @@
 //! The families of ordinary imperfections: one property of all instruments or magnets of a sort.
 
+use inference::BaseTerm;
 use twin::{EffectKind, Plane, Ring, Site};
 
 use super::close_tunes;
@@ -43,29 +44,29 @@ pub struct Family {
 const HIDDEN: f64 = 0.15;
 /// Gains scatter by 2 to 5 % (J. Safranek, NIM A 388 (1997) 27); surveys leave 10 mrad to instruments and 1 mrad to quadrupoles;
 /// the planes of an instrument that reads or kicks in both are coupled by a per cent, each by itself: half of the sum of both couplings is one of these
-/// families, half of the difference a roll; a common
-/// factor is one of the kick constant, of the electronics of all monitors, or the scale of a momentum; a dipole's poles are parallel to
-/// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`].
+/// families, half of the difference a roll; the electronics of all monitors have a common factor; a dipole's poles are parallel to
+/// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`]. What decks differ by is [`BaseTerm`]'s.
 ///
 /// Those that change the focusing come first: the vars absorb most of them, so that a fit takes them as exactly as the vars.
-const FAMILIES: [(&str, EffectKind, Grouping, f64); 17] = [
-    ("gradient in all dipoles", EffectKind::DipoleGradient, Grouping::All, 2e-3),
-    ("edge angle of all dipoles", EffectKind::DipoleEdge, Grouping::All, 5e-3),
-    ("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
-    ("momentum", EffectKind::MomentumOffset, Grouping::All, 1e-3),
-    ("gradients in straights", EffectKind::StrayGradient, Grouping::Each, 5e-4),
-    ("gains of monitors", EffectKind::BpmGain, Grouping::Each, 0.02),
-    ("gain of all horizontal monitors", EffectKind::BpmGain, Grouping::Plane(Plane::X), 0.03),
-    ("gain of all vertical monitors", EffectKind::BpmGain, Grouping::Plane(Plane::Y), 0.03),
-    ("gains of correctors", EffectKind::CorrectorGain, Grouping::Each, 0.02),
-    ("gain of all horizontal correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::X), 0.03),
-    ("gain of all vertical correctors", EffectKind::CorrectorGain, Grouping::Plane(Plane::Y), 0.03),
-    ("rolls of monitors", EffectKind::BpmRoll, Grouping::Each, 0.01),
-    ("rolls of correctors", EffectKind::CorrectorRoll, Grouping::Each, 0.01),
-    ("couplings of monitors", EffectKind::BpmCoupling, Grouping::Instrument, 0.01),
-    ("couplings of correctors", EffectKind::CorrectorCoupling, Grouping::Instrument, 0.01),
-    ("hysteresis of all correctors", EffectKind::CorrectorHysteresis, Grouping::All, 5e-3),
-    ("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, close_tunes::ROLL),
+const FAMILIES: [Family; 18] = [
+    Family::of_base(BaseTerm::DipoleGradient, Grouping::All),
+    Family::of_base(BaseTerm::DipoleEdge, Grouping::All),
+    Family::of("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
+    Family::of_base(BaseTerm::Momentum, Grouping::All),
+    Family::of("gradients in straights", EffectKind::StrayGradient, Grouping::Each, 5e-4),
+    Family::of("gains of monitors", EffectKind::BpmGain, Grouping::Each, 0.02),
+    Family::of("gain of all horizontal monitors", EffectKind::BpmGain, Grouping::Plane(Plane::X), 0.03),
+    Family::of("gain of all vertical monitors", EffectKind::BpmGain, Grouping::Plane(Plane::Y), 0.03),
+    Family::of("gains of correctors", EffectKind::CorrectorGain, Grouping::Each, 0.02),
+    Family::of_base(BaseTerm::Kick(Plane::X), Grouping::Plane(Plane::X)),
+    Family::of_base(BaseTerm::Kick(Plane::Y), Grouping::Plane(Plane::Y)),
+    Family::of_base(BaseTerm::RfStep, Grouping::All),
+    Family::of("rolls of monitors", EffectKind::BpmRoll, Grouping::Each, 0.01),
+    Family::of("rolls of correctors", EffectKind::CorrectorRoll, Grouping::Each, 0.01),
+    Family::of("couplings of monitors", EffectKind::BpmCoupling, Grouping::Instrument, 0.01),
+    Family::of("couplings of correctors", EffectKind::CorrectorCoupling, Grouping::Instrument, 0.01),
+    Family::of("hysteresis of all correctors", EffectKind::CorrectorHysteresis, Grouping::All, 5e-3),
+    Family::of("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, close_tunes::ROLL),
 ];
 
 impl Family {
@@ -81,16 +82,19 @@ impl Family {
         Self::of_machine().into_iter().chain([of_orbit]).collect()
     }
 
-    /// Those of magnets and instruments, as wide as their tolerances.
+    /// Those of magnets and instruments.
     pub fn of_machine() -> Vec<Self> {
-        let family = |&(name, kind, grouping, tolerance): &(_, _, _, f64)| Self {
-            name,
-            kind,
-            grouping,
-            tolerance,
-            width: tolerance,
-        };
-        FAMILIES.iter().map(family).collect()
+        FAMILIES.to_vec()
+    }
+
+    /// As wide as its tolerance.
+    const fn of(name: &'static str, kind: EffectKind, grouping: Grouping, tolerance: f64) -> Self {
+        Self { name, kind, grouping, tolerance, width: tolerance }
+    }
+
+    /// What all magnets or correctors of a deck have in common.
+    const fn of_base(term: BaseTerm, grouping: Grouping) -> Self {
+        Self { name: term.name(), kind: term.kind(), grouping, tolerance: term.ordinary(), width: term.width() }
     }
 
     /// Its members; of a family that each recording has for itself those of each.

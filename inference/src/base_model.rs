@@ -46,7 +46,7 @@ impl FittedTerm {
             measure: Measure::Mean,
             measured,
             unit: term.kind().unit(),
-            ordinary: term.width(),
+            ordinary: term.ordinary(),
         }
     }
 }
@@ -92,6 +92,15 @@ impl BaseTerm {
             Self::Momentum => EffectKind::MomentumOffset,
             Self::RfStep => EffectKind::RfStep,
             Self::Kick(_) => EffectKind::CorrectorGain,
+        }
+    }
+
+    /// Amplitude that is ordinary, in the unit of the kind: of its width, but for a kick constant, which a magnetic measurement tells to some per cent
+    /// and which decks state with another length or current all the same.
+    pub const fn ordinary(self) -> f64 {
+        match self {
+            Self::Kick(_) => 0.03,
+            _ => self.width(),
         }
     }
 

@@ -20,6 +20,7 @@ pub struct ImperfectionResult {
     /// For a person, of one that is seen.
     #[serde(skip)]
     pub(crate) row: Option<[String; 4]>,
+    /// In a sentence, of one that is larger than ordinary.
     #[serde(skip)]
     pub(crate) said: Option<String>,
 }
@@ -31,7 +32,7 @@ impl From<&Imperfection> for ImperfectionResult {
             Measure::Mean => [measured.value, 0.0],
             Measure::Scatter => [0.0, measured.value],
         };
-        let (row, said) = (one.is_seen().then(|| one.row()), one.is_seen().then(|| one.said()));
+        let (row, said) = (one.is_seen().then(|| one.row()), one.is_large().then(|| one.said()));
         Self { kind, at: one.at.clone(), mean, scatter, sigma: measured.sigma, unit: unit.symbol, row, said }
     }
 }

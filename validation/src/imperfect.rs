@@ -40,9 +40,9 @@ const TRIES: usize = 200;
 impl Families {
     /// Those of a machine with such recordings.
     pub fn of(data: &Data) -> Self {
-        let drawn = |family: Family, scatters| Drawn { members: family.members(data), width: family.width, scatters };
-        let ordinary = Family::of_machine().into_iter().map(|family| drawn(family, family.is_learnt()));
-        let hidden = Family::hidden(data).into_iter().map(|family| drawn(family, false));
+        let drawn = |family: Family, width, scatters| Drawn { members: family.members(data), width, scatters };
+        let ordinary = Family::of_machine().into_iter().map(|one| drawn(one, one.tolerance, one.is_learnt()));
+        let hidden = Family::hidden(data).into_iter().map(|family| drawn(family, family.width, false));
         Self(ordinary.chain(hidden).collect())
     }
 
