@@ -28,7 +28,7 @@ use super::term::Term;
 use super::tested::Tested;
 use super::transients::Transient;
 use super::widths;
-use inference::{Imperfection, POSITION};
+use inference::{Imperfection, Measure, POSITION};
 
 /// The result of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -450,13 +450,18 @@ pub fn sentence(
     };
     let contradicted = contradictions.iter().map(|one| in_recording(data, &one.recording, one.to_string()));
     let mut said: Vec<String> = contradicted.chain(beyond.iter().map(OutOfRange::to_string)).collect();
+    let (common, scatters): (Vec<Imperfection>, Vec<Imperfection>) = (widths::rows(data, &found.best).into_iter())
+        .filter(Imperfection::is_large)
+        .partition(|row| row.measure == Measure::Mean);
     // these are no missing physics, and a consistent recording's sentence begins with them
-    if verdict == Verdict::Consistent && !said.is_empty() {
+    if verdict == Verdict::Consistent && !(said.is_empty() && common.is_empty()) {
         said.push(format!("besides, {text}"));
     } else {
         said.insert(0, text);
     }
-    said.extend(remarks(data, found));
+    said.splice(0..0, Imperfection::list("off throughout the ring", &common));
+    said.extend(Imperfection::list("larger than ordinary", &scatters));
+    said.extend(remarks(data));
     capitalised(&said.join("; "))
 }
 
@@ -465,14 +470,9 @@ fn in_recording(data: &Data, recording: &str, said: String) -> String {
     if data.is_joint() { format!("in {recording} {said}") } else { said }
 }
 
-/// What is said besides: of ordinary imperfections, noise, frames and monitors.
-fn remarks(data: &Data, found: &Found) -> Vec<String> {
+/// What is said besides: of noise, frames and monitors.
+fn remarks(data: &Data) -> Vec<String> {
     let mut remarks = Vec::new();
-    let large: Vec<String> =
-        widths::rows(data, &found.best).iter().filter(|row| row.is_large()).map(Imperfection::said).collect();
-    if !large.is_empty() {
-        remarks.push(format!("larger than ordinary: {}", large.join(", ")));
-    }
     for own in data.campaigns() {
         remarks.extend(own.close_tunes.iter().map(|one| in_recording(data, &own.name, one.to_string())));
         remarks.extend(own.noise.remarks().into_iter().map(|said| in_recording(data, &own.name, said)));

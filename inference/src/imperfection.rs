@@ -59,6 +59,12 @@ impl Imperfection {
         format!("{} {}", self.what(), self.size())
     }
 
+    /// Several in a sentence; none without any.
+    pub fn list(what: &str, all: &[Self]) -> Option<String> {
+        let said: Vec<String> = all.iter().map(Self::said).collect();
+        (!said.is_empty()).then(|| format!("{what}: {}", said.join(", ")))
+    }
+
     fn what(&self) -> String {
         if self.at == "all" { self.name.to_owned() } else { format!("{}, {}", self.name, self.at) }
     }

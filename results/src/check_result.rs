@@ -6,7 +6,7 @@ use estimator::Walk;
 use comfy_table::CellAlignment;
 use diagnosis::{DataError, Miswired};
 use inference::stream::{self, Core};
-use inference::{Campaign, Lack, Recording};
+use inference::{BaseModel, BatchFit, Campaign, Lack, Recording, TuneUse};
 use schemars::JsonSchema;
 use serde::Serialize;
 use training::rooms::largest;
@@ -15,6 +15,7 @@ use twin::{Hold, Optics, Ring, Tunes};
 use crate::campaign::{campaign, not_modelled, strays};
 use crate::error::CommandError;
 use crate::fit_result::{Monitor, TunesMeasured, faults, lack, monitors};
+use crate::imperfection::ImperfectionResult;
 use crate::output::{lines, table};
 
 /// Fewest monitors with readings, and correctors that were moved, for a diagnosis.
@@ -38,6 +39,8 @@ pub struct CheckResult {
     tunes: Option<Design>,
     tunes_measured: TunesMeasured,
     monitors: Vec<Monitor>,
+    /// What the design may be off by throughout the ring, of a batch fit; none without one.
+    imperfections: Vec<ImperfectionResult>,
     /// Monitors without any reading.
     silent_monitors: Vec<String>,
     /// Share of readings that are missing.
@@ -126,11 +129,19 @@ impl CheckResult {
             tunes_measured: TunesMeasured::of_recording(&campaign.recording, tunes.map(|t| [t.x, t.y])),
             tunes: tunes.map(|t| Design { x: t.x, y: t.y }),
             monitors: monitors(ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
+            imperfections: imperfections(campaign),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),
             missing: readings.iter().filter(|reading| reading.is_nan()).count() as f64 / readings.len().max(1) as f64,
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],
         }
     }
+}
+
+/// What the design is off by; none where no batch fit ends.
+fn imperfections(campaign: &Campaign) -> Vec<ImperfectionResult> {
+    let fit = BatchFit::best(campaign, TuneUse::Readings, BaseModel::UNCERTAIN, |_| ());
+    let terms = fit.map(|fit| fit.base).unwrap_or_default();
+    terms.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect()
 }
 
 /// Times in the cycle along a ramp [ms]; none where the machine file has none.
@@ -320,8 +331,9 @@ impl CheckResult {
             ("monitors", faults(&self.monitors)),
             ("readings missing", format!("{:.1} %", 100.0 * self.missing)),
         ];
+        let off = ImperfectionResult::large(&self.imperfections).map(|large| ("off throughout", large));
         let lists = [("without a kick", &settings.unused), ("without a reading", &self.silent_monitors)];
         let lists = lists.into_iter().filter(|(_, names)| !names.is_empty());
-        facts.into_iter().chain(lists.map(|(name, names)| (name, names.join(", ")))).collect()
+        facts.into_iter().chain(off).chain(lists.map(|(name, names)| (name, names.join(", ")))).collect()
     }
 }

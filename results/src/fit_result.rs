@@ -267,9 +267,8 @@ impl FitResult {
     /// What a reader has to know before using the numbers.
     fn remarks(&self) -> Vec<String> {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
-        let large: Vec<&str> = self.imperfections.iter().filter_map(|one| one.said.as_deref()).collect();
         let remarks = [
-            (!large.is_empty()).then(|| format!("the design is off: {}", large.join(", "))),
+            ImperfectionResult::large(&self.imperfections).map(|large| format!("off throughout the ring: {large}")),
             self.lack.as_ref().map(|lack| format!("{lack}: the result is the prior, but for measured tunes")),
             self.tunes.and_then(|tunes| self.tunes_measured.remark(&tunes)),
             (!clipped.is_empty()).then(|| format!("* at a bound of the prior's range: {}", clipped.join(", "))),

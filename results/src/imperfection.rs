@@ -36,3 +36,11 @@ impl From<&Imperfection> for ImperfectionResult {
         Self { kind, at: one.at.clone(), mean, scatter, sigma: measured.sigma, unit: unit.symbol, row, said }
     }
 }
+
+impl ImperfectionResult {
+    /// Those that are larger than ordinary, in a sentence; none without any.
+    pub(crate) fn large(all: &[Self]) -> Option<String> {
+        let said: Vec<&str> = all.iter().filter_map(|one| one.said.as_deref()).collect();
+        (!said.is_empty()).then(|| said.join(", "))
+    }
+}
