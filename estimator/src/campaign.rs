@@ -107,6 +107,22 @@ pub fn move_mean(mean: &mut i32, value: i32, n: u32) {
     *mean = mean.saturating_add(((step + half) / n) as i32);
 }
 
+/// A reading moved to the mean drive of its setting: that of the frames before it, in which it is compared, and that with its own, in which the
+/// next one is.
+#[derive(Debug, Clone, Copy)]
+pub struct Moved {
+    /// To the mean drive before the frame, in steps.
+    pub before: i32,
+    /// To that with the frame, in steps.
+    pub after: i32,
+}
+
+/// Distance of a drive from the mean of those before it, over that from the mean with it, the `n`-th.
+pub fn before_last(n: u32) -> f32 {
+    let n = n.max(2) as f32;
+    n / (n - 1.0)
+}
+
 /// The last reading of a monitor in a setting, moved to the mean drive, and how many in a row that agree, this one included, wait for a
 /// repeat that confirms them: four times its code, and that number, at most 3.
 #[derive(Debug, Clone, Copy)]
@@ -181,6 +197,11 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
     /// Its time in the cycle [us].
     pub fn cycle_time(&self) -> u32 {
         self.setting.cycle_time
+    }
+
+    /// How many frames it has.
+    pub fn frames(&self) -> u32 {
+        self.frames
     }
 
     /// What drove the beam, on average.
@@ -275,9 +296,10 @@ impl<const B: usize, const C: usize, const F: usize> Cell<B, C, F> {
 
     /// Take a reading in as judged; `scatter` hears of each that is counted how far it is from the mean of those before [m], and
     /// how many there are now.
-    pub fn take(&mut self, b: usize, code: i32, moved: i32, verdict: Verdict, mut scatter: impl FnMut(f32, u32)) {
+    pub fn take(&mut self, b: usize, code: i32, moved: Moved, verdict: Verdict, mut scatter: impl FnMut(f32, u32)) {
         let before = self.last_code(b).unwrap_or(0);
-        self.last.get_mut(b).into_iter().for_each(|last| *last = Last::new(moved, verdict.waiting()));
+        self.last.get_mut(b).into_iter().for_each(|last| *last = Last::new(moved.after, verdict.waiting()));
+        let moved = moved.before;
         match verdict {
             Verdict::Held { .. } => {}
             Verdict::Accepted => self.add(b, code, moved, &mut scatter),
@@ -503,7 +525,9 @@ mod tests {
         let mut scatter = 0.0;
         for code in codes {
             // the squared distance from the mean grows the sum of squared deviations by (n - 1)/n
-            cell.take(0, code, code, Verdict::Accepted, |d, n| scatter += d * d * (n as f32 - 1.0) / n as f32);
+            cell.take(0, code, Moved { before: code, after: code }, Verdict::Accepted, |d, n| {
+                scatter += d * d * (n as f32 - 1.0) / n as f32
+            });
         }
         let mean = codes.iter().sum::<i32>() as f32 / 5.0;
         assert_eq!(cell.mean(0).1, 5);
@@ -524,7 +548,7 @@ mod tests {
         for &(code, expected, verdict) in story {
             let judged = cell.judge(0, code, 1.5e-4, Gate::default(), Beside { expected, ..beside });
             assert_eq!(judged, verdict, "{code} in {story:?}");
-            cell.take(0, code, code, judged, |_, _| ());
+            cell.take(0, code, Moved { before: code, after: code }, judged, |_, _| ());
         }
     }
 

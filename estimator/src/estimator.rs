@@ -9,6 +9,7 @@ mod drift;
 mod laplace;
 mod pooling;
 mod posterior;
+mod read_back;
 mod reference;
 mod remarks;
 mod screen;
@@ -45,6 +46,7 @@ pub use laplace::FitQuality;
 use pooling::Work;
 use posterior::Posterior;
 pub use posterior::Walk;
+use read_back::ReadBack;
 use reference::Reference;
 use sequence::Sequence;
 use times::Times;
@@ -223,6 +225,7 @@ struct Past<
 > {
     campaign: Campaign<B, C, F, S>,
     reference: Reference<C>,
+    read_back: ReadBack,
     /// The last frames that belong to no setting.
     recent: Deque<Loose<B, C, F, W>, RECENT>,
     /// The prior, and older ones: they cannot be linearised anew.
@@ -234,6 +237,7 @@ struct Past<
 state!([const B: usize, const C: usize, const F: usize, const N: usize, const S: usize, const K: usize, const T: usize, const W: usize] Past<B, C, F, N, S, K, T, W> {
     campaign,
     reference,
+    read_back,
     recent,
     loose,
     stale,
@@ -381,6 +385,7 @@ impl<
         past: Past {
             campaign: Campaign::BLANK,
             reference: Reference::ZERO,
+            read_back: ReadBack::FOLLOWED,
             recent: Deque::new(),
             loose: Gaussian::BLANK,
             stale: false,
@@ -410,7 +415,7 @@ impl<
         self.peers = Peers::EXPECTED;
         self.tunes.iter_mut().for_each(TuneMeter::clear);
         self.past.campaign.clear();
-        self.past.reference = Reference::ZERO;
+        (self.past.reference, self.past.read_back) = (Reference::ZERO, ReadBack::FOLLOWED);
         self.past.recent.clear();
         let calibration = model.setup.tune_calibration.unwrap_or(1.0);
         self.past.loose.reset(
@@ -477,6 +482,12 @@ impl<
             return self.judged(frame, drive, (whole, expected), (None, none));
         }
         let cell = setting.and_then(|setting| self.find_cell(model, &setting, &drive));
+        if let Some(cell) = cell
+            && self.learn_read_back(model, &frame, &drive, cell)
+        {
+            self.predict(model, &drive);
+            self.predict_mean(model, cell);
+        }
         let screened = self.screen(model, &frame, &drive, cell, whole, &expected);
         self.judged(frame, drive, (whole, expected), (cell, screened))
     }
@@ -485,6 +496,10 @@ impl<
     #[inline(never)]
     pub fn learn(&mut self, model: &Model<'_, G, B, C, F>, judged: &mut Judged<B, C, F, W>) {
         if judged.remarks.put_aside {
+            // its drive tells where correctors stand, as long as no others do
+            if !self.past.recent.is_full() {
+                self.keep_loose(model, &judged.frame, &judged.drive, &judged.screened);
+            }
             return;
         }
         let Judged { frame, drive, cell, screened, nis, .. } = judged;
@@ -616,13 +631,18 @@ impl<
     #[inline(never)]
     fn find_cell(&mut self, model: &Model<'_, G, B, C, F>, setting: &Setting, drive: &Drive<C, F>) -> Option<u16> {
         let index = self.past.campaign.find(setting)?;
-        let cell = self.past.campaign.cell_mut(index)?;
-        cell.add_drive(drive);
-        let mean = about(&cell.drive(), &self.tangent.supplies);
+        self.past.campaign.cell_mut(index)?.add_drive(drive);
+        self.predict_mean(model, index);
+        Some(index)
+    }
+
+    /// What the mean drive of a cell would have made of the frame.
+    fn predict_mean(&mut self, model: &Model<'_, G, B, C, F>, cell: u16) {
+        let Some(cell) = self.past.campaign.cells().get(usize::from(cell)) else { return };
+        let mean = about(&self.believed(&cell.drive()), &self.tangent.supplies);
         model.surrogate.orbit(&self.tangent.linearised, &mean, &mut self.predicted.at_mean_drive);
         follow(&self.following, &mean.strength, &mut self.predicted.at_mean_drive);
         self.predicted.off_mean = less(&self.predicted.strength, &mean.strength);
-        Some(index)
     }
 
     /// Predict the frame.
@@ -634,7 +654,7 @@ impl<
     }
 
     fn predict_drive(&mut self, model: &Model<'_, G, B, C, F>, drive: &Drive<C, F>) {
-        let drive = about(drive, &self.tangent.supplies);
+        let drive = about(&self.believed(drive), &self.tangent.supplies);
         model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
         follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
     }

@@ -70,7 +70,7 @@ impl<
         }
         for cell in self.past.campaign.cells() {
             let first_channel = self.first_channel(cell.cycle_time());
-            let drive = about(&cell.drive(), &self.tangent.supplies);
+            let drive = about(&self.believed(&cell.drive()), &self.tangent.supplies);
             model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
             follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
             for (b, _) in self.monitors.iter().enumerate().filter(is_ok) {

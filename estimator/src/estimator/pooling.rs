@@ -130,7 +130,7 @@ impl<
         let Tangent { linearised, supplies, .. } = &self.anew.tangent;
         let from_here = self.past.campaign.cells().iter().zip(0..).skip(first);
         let Some((first, _)) = from_here.clone().next() else { return };
-        model.surrogate.predict(linearised, &first.alone(), &mut self.predicted.prediction);
+        model.surrogate.predict(linearised, &self.believed(&first.alone()), &mut self.predicted.prediction);
         let by_supply = self.predicted.prediction.by_supply;
         let first_channel = self.first_channel(first.cycle_time());
         let mut lines = [Line::default(); B];
@@ -139,7 +139,7 @@ impl<
             if pooling.settings.get_mut(index).is_none_or(|counted| core::mem::replace(counted, true)) {
                 continue;
             }
-            let (drive, share) = (cell.drive(), cell.share(first));
+            let (drive, share) = (self.believed(&cell.drive()), cell.share(first));
             let strength = about(&drive, supplies).strength;
             let direct = Drive { strength: [0.0; F], ..drive };
             model.surrogate.orbit(linearised, &direct, &mut self.predicted.prediction.reading);
@@ -167,7 +167,7 @@ impl<
     #[inline(never)]
     fn pool_frame(&mut self, model: &Model<'_, G, B, C, F>, frame: &Late<B, C, F, W>) {
         let Tangent { linearised, supplies, .. } = &self.anew.tangent;
-        let drive = about(&frame.drive, supplies);
+        let drive = about(&self.believed(&frame.drive), supplies);
         model.surrogate.predict(linearised, &drive, &mut self.predicted.prediction);
         follow(&self.following, &drive.strength, &mut self.predicted.prediction.reading);
         let Work::Past(Pooling { gaussian, pool, .. }) = &mut self.anew.work else { return };

@@ -1,9 +1,10 @@
 //! The drive from which settings are counted, and the setting of a frame.
 //!
 //! A campaign moves one corrector at a time from 0 A. A machine under feedback holds all of them somewhere, and moves them seldom,
-//! or one at a time about there. What is moved is told by the orbit that it makes, not by amperes.
+//! or one at a time about there. What is moved is told by the orbit that it makes, not by amperes, and where correctors that stay scatter by
+//! more than is noticed, by that scatter.
 
-use super::{Estimator, Model, underweighted};
+use super::{Estimator, Model, RECENT, underweighted};
 use crate::campaign::{Setting, is_moved};
 use crate::drive::Drive;
 use crate::gaussian::Reading;
@@ -19,6 +20,13 @@ const IDLE: f32 = 0.1;
 const MOST: f64 = 1.0 / 16.0;
 /// Of the recent frames, so many parts of four must belong to a setting about a new reference drive.
 const PARTS: usize = 3;
+/// Standard deviations that the scatter of an idle corrector reaches.
+const SCATTERS: f32 = 6.0;
+/// Kick of the corrector that is moved over the standard deviation of the others, from which on these are idle: with less, what the mean of a
+/// setting loses of the params counts.
+const STANDS_OUT: f32 = 16.0;
+/// Mean square orbit of idle correctors that scatter, over its median, that they do not reach.
+const REACHES: f32 = 3.0;
 
 /// Kicks from which settings are counted.
 #[derive(Debug, Clone)]
@@ -30,13 +38,49 @@ pub(super) struct Reference<const C: usize> {
     waited: u16,
     /// Mean of the kicks that the baselines were read at.
     read_at: [f32; C],
+    scatter: Scatter,
 }
 
-state!([const C: usize] Reference<C> { number, kick, waited, read_at });
+state!([const C: usize] Reference<C> { number, kick, waited, read_at, scatter });
+
+/// How idle correctors scatter about the reference drive; zero where nobody notices.
+#[derive(Debug, Clone, Copy)]
+struct Scatter {
+    /// Standard deviation of a kick [rad].
+    kick: f32,
+    /// Mean square orbit that they reach, over that which is noticed.
+    orbit: f32,
+}
+
+state!([] Scatter { kick, orbit });
+
+impl Scatter {
+    const NONE: Self = Self { kick: 0.0, orbit: 0.0 };
+
+    /// How far the kick of an idle corrector is off the reference at most [rad].
+    fn reach(&self) -> f32 {
+        SCATTERS * self.kick
+    }
+}
 
 impl<const C: usize> Reference<C> {
     /// All correctors at 0 A.
-    pub const ZERO: Self = Self { number: 0, kick: [0.0; C], waited: 0, read_at: [0.0; C] };
+    pub const ZERO: Self = Self { number: 0, kick: [0.0; C], waited: 0, read_at: [0.0; C], scatter: Scatter::NONE };
+
+    /// True if idle correctors scatter by more than is noticed.
+    pub fn scatters(&self) -> bool {
+        self.scatter.kick > 0.0
+    }
+
+    /// Kicks of idle correctors off the reference, the others 0 [rad].
+    pub fn scattered(&self, kick: &[f32; C]) -> [f32; C] {
+        let mut off = *kick;
+        for (off, reference) in off.iter_mut().zip(&self.kick) {
+            *off -= reference;
+            *off = if off.abs() <= self.scatter.reach() { *off } else { 0.0 };
+        }
+        off
+    }
 
     /// A frame's kicks, seen from it, and nothing else of its drive.
     fn moved<const F: usize>(&self, drive: &Drive<C, F>) -> Drive<C, F> {
@@ -88,12 +132,14 @@ impl<
         let mut alone = Drive { kick: [0.0; C], ..moved };
         alone.kick.get_mut(corrector).into_iter().for_each(|own| *own = kick);
         let idle = kick.abs() / libm::sqrtf(self.noticed(model, &alone));
-        Some(at_rest.with(u16::try_from(corrector).ok()?, kick, idle))
+        Some(at_rest.with(u16::try_from(corrector).ok()?, kick, idle.max(self.past.reference.scatter.reach())))
     }
 
-    /// True if kicks move the orbit by less than is noticed.
+    /// True if kicks move the orbit by less than is noticed, or if they are no more than the scatter of idle correctors.
     fn is_idle(&mut self, model: &Model<'_, G, B, C, F>, moved: &Drive<C, F>) -> bool {
-        self.noticed(model, moved) <= 1.0
+        let (noticed, scatter) = (self.noticed(model, moved), self.past.reference.scatter);
+        let is_scatter = || moved.kick.iter().all(|kick| kick.abs() <= scatter.reach());
+        noticed <= 1.0 || (noticed <= scatter.orbit && is_scatter())
     }
 
     /// Mean square orbit of kicks over that which is noticed.
@@ -114,14 +160,15 @@ impl<
             return false;
         }
         self.past.reference.waited = 0;
-        let former = self.past.reference.kick;
+        let former = (self.past.reference.kick, self.past.reference.scatter);
         self.past.reference.kick = core::array::from_fn(|c| self.median_kick(c));
+        self.past.reference.scatter = self.scatter_about_reference(model);
         let repeats = (0..recent).filter(|&at| self.repeats_about_reference(model, at)).count();
         if 4 * repeats >= PARTS * recent {
             // not 0 again, which means that there is none
             self.past.reference.number = self.past.reference.number.checked_add(1).unwrap_or(1);
         } else {
-            self.past.reference.kick = former;
+            (self.past.reference.kick, self.past.reference.scatter) = former;
         }
         true
     }
@@ -176,22 +223,49 @@ impl<
         true
     }
 
-    /// Median of the recent kicks of a corrector, whatever share of them is the same: the mean of the smallest that half of them do not
-    /// exceed, and of the largest that half of them do not fall short of.
+    /// Median of the recent kicks of a corrector, whatever share of them is the same.
     fn median_kick(&self, c: usize) -> f32 {
-        let kicks = || self.past.recent.iter().filter_map(|frame| frame.drive.kick.get(c)).copied();
-        let half = self.past.recent.len() / 2;
-        let low = kicks().filter(|value| kicks().filter(|kick| kick <= value).count() >= half);
-        let high = kicks().filter(|value| kicks().filter(|kick| kick >= value).count() >= half);
-        0.5 * (low.fold(f32::MAX, f32::min) + high.fold(f32::MIN, f32::max))
+        median(|| self.past.recent.iter().filter_map(|frame| frame.drive.kick.get(c)).copied())
+    }
+
+    /// How the correctors that are not moved scatter about the reference in the recent frames; none if that is not noticed, or if no corrector
+    /// that is moved stands out.
+    fn scatter_about_reference(&mut self, model: &Model<'_, G, B, C, F>) -> Scatter {
+        let others = model.surrogate.layout().correctors().saturating_sub(1).max(1) as f32;
+        let (mut variance, mut orbit, mut most) = ([0.0; RECENT], [0.0; RECENT], 0.0_f32);
+        for (at, (variance, orbit)) in variance.iter_mut().zip(&mut orbit).enumerate() {
+            let Some((kick, rest)) = self.moved_in_recent(at) else { continue };
+            most = most.max(kick.abs());
+            *variance = rest.kick.iter().map(|kick| kick * kick).sum::<f32>() / others;
+            *orbit = self.noticed(model, &rest);
+        }
+        let kick = libm::sqrtf(median(|| variance.iter().copied()));
+        let orbit = median(|| orbit.iter().copied());
+        if orbit > 1.0 / REACHES && most > STANDS_OUT * kick {
+            Scatter { kick, orbit: REACHES * orbit }
+        } else {
+            Scatter::NONE
+        }
     }
 
     /// True if at most one corrector is moved from the reference in a recent frame.
     fn repeats_about_reference(&mut self, model: &Model<'_, G, B, C, F>, at: usize) -> bool {
-        let Some(drive) = self.past.recent.get(at).map(|frame| frame.drive) else { return false };
-        let mut moved = self.past.reference.moved(&drive);
-        let largest = moved.kick.iter_mut().reduce(|a, b| if b.abs() > a.abs() { b } else { a });
-        largest.into_iter().for_each(|kick| *kick = 0.0);
-        self.is_idle(model, &moved)
+        self.moved_in_recent(at).is_some_and(|(_, rest)| self.is_idle(model, &rest))
     }
+
+    /// Largest kick off the reference in a recent frame [rad], and the others.
+    fn moved_in_recent(&self, at: usize) -> Option<(f32, Drive<C, F>)> {
+        let mut moved = self.past.reference.moved(&self.past.recent.get(at)?.drive);
+        let largest = moved.kick.iter_mut().reduce(|a, b| if b.abs() > a.abs() { b } else { a })?;
+        Some((core::mem::take(largest), moved))
+    }
+}
+
+/// Median of some values, whatever share of them is the same: the mean of the smallest that half of them do not exceed, and of the largest that
+/// half of them do not fall short of.
+fn median<I: Iterator<Item = f32>>(values: impl Fn() -> I) -> f32 {
+    let half = values().count() / 2;
+    let low = values().filter(|value| values().filter(|other| other <= value).count() >= half);
+    let high = values().filter(|value| values().filter(|other| other >= value).count() >= half);
+    0.5 * (low.fold(f32::MAX, f32::min) + high.fold(f32::MIN, f32::max))
 }

@@ -2,7 +2,7 @@
 
 use super::whole::Whole;
 use super::{Estimator, Model};
-use crate::campaign::{Beside, Verdict, is_moved};
+use crate::campaign::{Beside, Cell, Moved, Verdict, before_last, is_moved};
 use crate::drive::Drive;
 use crate::judged::{Expected, Screened};
 use crate::monitor::Monitor;
@@ -131,16 +131,16 @@ impl<
         (index, expected, is_lone): (u16, bool, bool),
         screened: &mut Screened<W>,
     ) {
-        let moved = self.moved_to_mean_drive(b, code);
+        let moved = self.moved_to_mean_drive(b, code, index);
         let (Some(monitor), Some(cell)) = (self.monitors.get_mut(b), self.past.campaign.cell_mut(index)) else {
             return;
         };
-        if let Some(difference) = cell.difference(b, moved) {
+        if let Some(difference) = cell.difference(b, moved.before) {
             monitor.noise.learn(difference);
         }
         let beside = Beside { expected, is_lone, jumps: monitor.jumps(), is_told: monitor.noise.is_told() };
         let waited = cell.waiting(b);
-        let verdict = cell.judge(b, moved, monitor.noise.sigma(), model.setup.gate, beside);
+        let verdict = cell.judge(b, moved.before, monitor.noise.sigma(), model.setup.gate, beside);
         let (following, off_mean) = (self.following.get_mut(b), &self.predicted.off_mean);
         if let Some(following) = following {
             let variance = f64::from(monitor.variance());
@@ -166,12 +166,20 @@ impl<
     }
 
     /// A reading as the mean drive of its setting would have made it, in steps.
-    fn moved_to_mean_drive(&self, b: usize, code: i32) -> i32 {
+    fn moved_to_mean_drive(&self, b: usize, code: i32, index: u16) -> Moved {
         let shift = match (self.predicted.at_mean_drive.get(b), self.predicted.prediction.reading.get(b)) {
             (Some(mean), Some(this)) => mean - this,
             _ => 0.0,
         };
-        let moved = code.saturating_add(libm::roundf(shift / PositionCode::METRES_PER_LSB) as i32);
-        moved.clamp(-PositionCode::LIMIT, PositionCode::LIMIT)
+        let moved = |shift: f32| {
+            let moved = code.saturating_add(libm::roundf(shift / PositionCode::METRES_PER_LSB) as i32);
+            moved.clamp(-PositionCode::LIMIT, PositionCode::LIMIT)
+        };
+        let after = moved(shift);
+        match self.past.campaign.cells().get(usize::from(index)).map(Cell::frames) {
+            // the frame has moved the mean drive by the share of it that nobody notices elsewhere
+            Some(n @ 2..) if self.past.reference.scatters() => Moved { before: moved(shift * before_last(n)), after },
+            _ => Moved { before: after, after },
+        }
     }
 }
