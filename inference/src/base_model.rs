@@ -63,16 +63,6 @@ const LEAST: f64 = 0.2;
 const STEP: f64 = 1e-3;
 
 impl BaseTerm {
-    /// All of them.
-    pub const ALL: [Self; 6] = [
-        Self::DipoleGradient,
-        Self::DipoleEdge,
-        Self::Momentum,
-        Self::RfStep,
-        Self::Kick(Plane::X),
-        Self::Kick(Plane::Y),
-    ];
-
     /// What it is.
     pub const fn name(self) -> &'static str {
         match self {
@@ -154,12 +144,10 @@ impl BaseTerm {
 impl BaseModel {
     /// A design that is taken for exact.
     pub const EXACT: Self = Self { terms: &[] };
-    /// A design with the uncertainty that designs have.
-    pub const UNCERTAIN: Self = Self { terms: &BaseTerm::ALL };
 
     /// What changes the ring itself: vars imitate it.
     pub const MAGNETS: Self = Self { terms: &[BaseTerm::DipoleGradient, BaseTerm::DipoleEdge, BaseTerm::Momentum] };
-    /// What scales kicks and RF offsets: vars cannot imitate it.
+    /// What scales kicks and RF offsets: vars cannot imitate it, and a fit knows it.
     pub const SCALES: Self = Self { terms: &[BaseTerm::RfStep, BaseTerm::Kick(Plane::X), BaseTerm::Kick(Plane::Y)] };
 
     /// Its terms.
@@ -197,5 +185,82 @@ impl BaseModel {
             prior.range.push(term.range());
         }
         prior
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use core::f64::consts::PI;
+
+    use twin::{Hold, Optics};
+
+    use super::*;
+    use crate::campaign::Linearised;
+    use crate::recording::Drive;
+
+    const TERMS: [BaseTerm; 6] = [
+        BaseTerm::DipoleGradient,
+        BaseTerm::DipoleEdge,
+        BaseTerm::Momentum,
+        BaseTerm::RfStep,
+        BaseTerm::Kick(Plane::X),
+        BaseTerm::Kick(Plane::Y),
+    ];
+    const ALL: BaseModel = BaseModel { terms: &TERMS };
+
+    fn amplitudes(term: BaseTerm, amplitude: f64) -> [f64; 6] {
+        TERMS.map(|own| if own == term { amplitude } else { 0.0 })
+    }
+
+    /// `dQ = +-sum of beta K1L/(4 pi)`, beta at the middle of each dipole. Source: S. Y. Lee, Accelerator Physics, ch. 2, effects of gradient errors.
+    #[test]
+    fn a_gradient_in_all_dipoles_moves_the_tunes_as_the_text_book_says() {
+        let (ring, a) = (Ring::booster(), 1e-5);
+        let off = ALL.ring(&ring, &amplitudes(BaseTerm::DipoleGradient, a));
+        let hold = Hold::Momentum { delta: 0.0 };
+        let (optics, changed) = (Optics::of(&ring, hold).unwrap(), Optics::of(&off, hold).unwrap());
+        let moved = [
+            changed.tunes().unwrap().x - optics.tunes().unwrap().x,
+            changed.tunes().unwrap().y - optics.tunes().unwrap().y,
+        ];
+        for (plane, sign) in [(Plane::X, 1.0), (Plane::Y, -1.0)] {
+            let dipoles = EffectKind::DipoleGradient.sites(&ring).into_iter().map(|site| site.elements(&ring)[0]);
+            let beta = |element: usize| {
+                let [start, middle, end] = [0.0, 0.5, 1.0].map(|share| {
+                    optics.beta(twin::Place { element, depth: share * ring.elements[element].length }, plane)
+                });
+                (start + 4.0 * middle + end) / 6.0
+            };
+            let known = sign * a / (4.0 * PI) * dipoles.map(beta).sum::<f64>();
+            // Simpson's rule over a dipole of 10 degrees
+            assert!((moved[plane.index()] / known - 1.0).abs() < 2e-3, "{moved:?} {known}");
+        }
+    }
+
+    /// The derivative by each term is that of twice the step, and a kick constant's is the response itself.
+    #[test]
+    fn derivatives_are_those_of_the_orbits() {
+        let ring = Ring::booster();
+        let machine = Machine::new(ring.clone(), Rf::FixedMomentum, &[]).unwrap();
+        let mut kick = DVector::zeros(48);
+        (kick[3], kick[30]) = (2e-4, -1e-4);
+        let drive = Drive { kick, strength: DVector::zeros(ring.supplies.len()), rf_offset: 2e-4 };
+        let supplies = vec![0.0; ring.supplies.len()];
+        let at = |amplitudes: [f64; 6]| {
+            let params = DVector::from_iterator(54, (0..48).map(|_| 0.0).chain(amplitudes));
+            let drives = std::slice::from_ref(&drive);
+            let linearised = Linearised::about((&machine, ALL), &params, &supplies, drives).unwrap();
+            (linearised.orbits(drives), linearised.slopes(drives))
+        };
+        let (_, slopes) = at([0.0; 6]);
+        for (k, term) in TERMS.into_iter().enumerate() {
+            let far = 0.1 * term.width();
+            let [above, below] = [far, -far].map(|far| at(amplitudes(term, far)).0);
+            let largest = (above.clone() - &below).amax() / (2.0 * far);
+            for (b, slope) in slopes.iter().enumerate() {
+                let known = (above[(0, b)] - below[(0, b)]) / (2.0 * far);
+                assert!((slope[(48 + k, 0)] - known).abs() < 2e-3 * largest, "{term:?} at {b}");
+            }
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! What vars make of a design that is off throughout the ring, where the design is taken for exact: in the core, and in draws.
+//! What vars make of magnets that are off throughout the ring, where the design is taken for exact: in core, batch fit and draws.
 //!
 //! Such a fit finds `theta + P b` instead of theta, with `b` the amplitudes of the base model's terms that change the magnets, whose prior is normal
 //! with covariance W, and
@@ -17,9 +17,9 @@ use nalgebra::{DMatrix, DVector};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::StandardNormal;
-use twin::{Machine, OrbitError, Ring};
+use twin::{Machine, Measured, OrbitError, Ring};
 
-use crate::base_model::BaseModel;
+use crate::base_model::{BaseModel, BaseTerm, FittedTerm};
 use crate::campaign::{Linearised, TUNE_CALIBRATION};
 use crate::draws::Draws;
 use crate::prior::Prior;
@@ -89,6 +89,17 @@ impl Imitation {
         let kept =
             DMatrix::identity(found.len(), found.len()) - &of_terms * DMatrix::from_diagonal(&self.prior.precision);
         (found - &self.pattern * self.mean(found), &kept * covariance * kept.transpose() + of_terms)
+    }
+
+    /// The amplitudes of the terms, given mean and covariance of theta that were found.
+    pub fn amplitudes(&self, found: &DVector<f64>, covariance: &DMatrix<f64>) -> Vec<FittedTerm> {
+        let weighed = DMatrix::from_diagonal(&self.prior.precision) * &self.pattern * &self.covariance;
+        let variance = &self.covariance + weighed.tr_mul(&(covariance * &weighed));
+        let fitted = |(k, (&term, &value)): (usize, (&BaseTerm, &f64))| FittedTerm {
+            term,
+            measured: Measured { value, sigma: variance[(k, k)].sqrt() },
+        };
+        BaseModel::MAGNETS.terms().iter().zip(&self.mean(found)).enumerate().map(fitted).collect()
     }
 
     /// Draws of the vars, given those that take the design for exact.

@@ -9,7 +9,7 @@
 //! let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
 //! let recording = Recording::read(folder.as_ref(), &ring)?;
 //! let campaign = Campaign::of(&ring, &recording)?; // settings, and which readings count
-//! let fit = BatchFit::best(&campaign, TuneUse::LeftOut, BaseModel::UNCERTAIN, |_| ())?;
+//! let fit = BatchFit::best(&campaign, TuneUse::LeftOut, BaseModel::SCALES, |_| ())?;
 //! assert!((0.9..1.1).contains(&fit.chi2_per_dof));
 //! let left_out: usize = (0..campaign.monitors()).map(|b| campaign.screened.excluded.tally(b).values().sum::<usize>()).sum();
 //! assert!(left_out > 0 && 10 * left_out < campaign.frames() * campaign.monitors());

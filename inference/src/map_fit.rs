@@ -27,8 +27,6 @@ pub struct BatchFit {
     pub map_params: Vec<f64>,
     /// Covariance of theta, whatever the base model's terms are.
     pub covariance: DMatrix<f64>,
-    /// The same of theta and, after it, of the base model's terms.
-    pub joint_covariance: DMatrix<f64>,
     /// Marginal of each theta.
     pub marginals: Vec<Marginal>,
     /// Sum of (residual / expected noise)^2 over readings of monitors in state ok, per degree of freedom (readings less baselines, less
@@ -171,13 +169,8 @@ impl BatchFit {
     /// # Errors
     /// [`OrbitError`] of unstable motion.
     pub fn optics(&self, campaign: &Campaign) -> Result<FittedOptics, OrbitError> {
-        let Campaign { ring, supplies, .. } = campaign;
-        let fitted_ring = |values: &[f64]| {
-            let (params, amplitudes) = values.split_at(self.map_params.len());
-            self.base_model.ring(&ring.with_strengths(&ring.strengths(params, supplies)), amplitudes)
-        };
-        let optics = CalibratedOptics::at(&self.values(), fitted_ring)?;
-        let sigma = optics.sigma(&self.joint_covariance);
+        let optics = CalibratedOptics::of(&campaign.ring, &self.map_params, &campaign.supplies)?;
+        let sigma = optics.sigma(&self.covariance);
         Ok((optics, sigma))
     }
 }
@@ -291,7 +284,6 @@ impl Problem<'_> {
             base: self.base.terms().iter().enumerate().map(fitted_term).collect(),
             base_model: self.base,
             covariance: covariance.view_range(..vars, ..vars).into_owned(),
-            joint_covariance: covariance,
             chi2_per_dof: if point.chi2.1 > 0.0 { point.chi2.0 / point.chi2.1 } else { f64::NAN },
             mismatch: quality(point.chi2).is_mismatch(),
             tunes: [tune(0, point.tunes.x), tune(1, point.tunes.y)],

@@ -62,8 +62,12 @@ fn baselines_follow_the_supplies() {
 fn the_density_and_the_fit_take_the_same_terms_out() {
     let (seed, tune) = MACHINES[0];
     let (campaign, _) = campaign(seed, tune);
-    let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
-    let reduced = Reduced::from_fit(campaign, fit).unwrap();
+    [BaseModel::EXACT, BaseModel::SCALES].into_iter().for_each(|base| assert_same_terms(&campaign, base));
+}
+
+fn assert_same_terms(campaign: &Campaign, base: BaseModel) {
+    let fit = BatchFit::best(campaign, TuneUse::Readings, base, |_| ()).unwrap();
+    let reduced = Reduced::from_fit(campaign.clone(), fit).unwrap();
     let model = ResponseModel::twin(&reduced.campaign.ring).unwrap();
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
     let curvature = readings.curvature(&model, &reduced.fit.map_params).unwrap();

@@ -395,6 +395,9 @@ pub struct Fit {
     #[command(flatten)]
     #[allow(missing_docs)] // flattened options carry their own docs
     pub sampling: Sampling,
+    /// Take the design for exact but for the vars, as the core does: dipoles, momentum and kick constants may else be off as those of decks are
+    #[arg(long)]
+    pub exact_design: bool,
     /// What the machine held while a response matrix was measured; the frequency without it
     #[arg(long, value_enum)]
     pub rf: Option<Rf>,

@@ -148,6 +148,8 @@ class FitResult(_Result):
     nuts: dict[str, Any] | None = None
     other: list[dict[str, Any]] = field(default_factory=list)
     """Gains and couplings of instruments, of a measured matrix."""
+    imperfections: list[dict[str, Any]] = field(default_factory=list)
+    """What the design is off by throughout the ring, of a recording."""
     wiring: list[dict[str, str]] = field(default_factory=list)
     degenerate: list[list[str]] = field(default_factory=list)
 

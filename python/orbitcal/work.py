@@ -14,15 +14,23 @@ if TYPE_CHECKING:
     import arviz
 
 
-def fit(recording: Recording, ring: Ring | None = None, *, rf: Rf | None = None, progress: bool = False) -> FitResult:
+def fit(
+    recording: Recording,
+    ring: Ring | None = None,
+    *,
+    rf: Rf | None = None,
+    exact_design: bool = False,
+    progress: bool = False,
+) -> FitResult:
     """The batch fit: damped Gauss-Newton on the exact twin to the maximum a posteriori, with its covariance.
 
     `ring` is the recording's unless another is given (other priors, for instance). Of a measured matrix `rf` says what the machine held
-    while it was measured; the frequency without it.
+    while it was measured; the frequency without it. Dipoles, momentum and kick constants may be off as those of decks are, unless the
+    design is exact.
     """
     ring = recording.ring if ring is None else ring
     with bar("fit", None, is_shown=progress) as hear:
-        return FitResult.of(_orbitcal.fit(ring._ring, recording._recording, rf, hear))
+        return FitResult.of(_orbitcal.fit(ring._ring, recording._recording, rf, exact_design, hear))
 
 
 def sample(
@@ -34,18 +42,21 @@ def sample(
     draws: int = 2000,
     seed: int = 1,
     model: Literal["twin", "green", "resnet", "linear"] = "twin",
+    exact_design: bool = False,
     progress: bool = True,
 ) -> arviz.InferenceData:
     """Full NUTS on the posterior of the vars, as ArviZ's InferenceData; nothing is written to disk.
 
-    `posterior["vars"]` has the dimensions chain, draw and var [1]; `sample_stats` has ArviZ's names. The seed fixes every draw. The
-    JSON of `orbitcal fit --method nuts` is in `attrs["orbitcal"]` of the posterior, as text.
+    `posterior["vars"]` has the dimensions chain, draw and var [1]; `sample_stats` has ArviZ's names. The seed fixes every draw, and
+    `exact_design` is as in `fit`. The JSON of `orbitcal fit --method nuts` is in `attrs["orbitcal"]` of the posterior, as text.
     """
     import arviz
 
     ring = recording.ring if ring is None else ring
     with bar("sample", chains * (warm_up + draws), is_shown=progress) as hear:
-        outcome, drawn = _orbitcal.sample(ring._ring, recording._recording, model, chains, warm_up, draws, seed, hear)
+        outcome, drawn = _orbitcal.sample(
+            ring._ring, recording._recording, model, chains, warm_up, draws, seed, exact_design, hear
+        )
     data = arviz.from_dict(
         posterior={"vars": drawn.pop("vars")},
         sample_stats=drawn,

@@ -10,7 +10,7 @@ use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use results::{
-    CommandError, Comparison, DiagnosedMatrix, DiagnosisResult, FitModel, FittedMatrix, compare_matrices,
+    Design, CommandError, Comparison, DiagnosedMatrix, DiagnosisResult, FitModel, FittedMatrix, compare_matrices,
     compare_recordings, comparison_page, diagnosis_page, fit_by_draws, fit_by_steps, fit_page,
 };
 
@@ -37,6 +37,10 @@ fn expect_no_rf(rf: Option<&str>) -> PyResult<()> {
     }
 }
 
+fn design(is_exact: bool) -> Design {
+    if is_exact { Design::Exact } else { Design::Uncertain }
+}
+
 /// The batch fit; `hear` gets each step's name and number.
 #[pyfunction]
 pub fn fit(
@@ -44,6 +48,7 @@ pub fn fit(
     ring: &Ring,
     recording: &Recording,
     rf: Option<&str>,
+    exact_design: bool,
     hear: Option<Bound<'_, PyAny>>,
 ) -> PyResult<Outcome> {
     recording.expect(&ring.ring)?;
@@ -52,7 +57,7 @@ pub fn fit(
             expect_no_rf(rf)?;
             let (ring, frames) = (ring.ring.clone(), Arc::clone(frames));
             task::run(py, hear, move |progress| {
-                let result = fit_by_steps(&ring, &frames, |step| progress.step("Gauss-Newton", step))?;
+                let result = fit_by_steps(&ring, &frames, design(exact_design), |step| progress.step("Gauss-Newton", step))?;
                 let shown = result.clone();
                 Outcome::of(&result, move || fit_page(&ring, &frames, &shown))
             })
@@ -80,6 +85,7 @@ pub fn sample<'py>(
     warm_up: usize,
     draws: usize,
     seed: u64,
+    exact_design: bool,
     hear: Option<Bound<'py, PyAny>>,
 ) -> PyResult<(Outcome, Bound<'py, PyDict>)> {
     let frames = recording.frames_of(&ring.ring)?;
@@ -98,7 +104,7 @@ pub fn sample<'py>(
     let (ring, frames) = (ring.ring.clone(), Arc::clone(frames));
     let settings = NutsSettings { chains, warm_up, draws, seed };
     let (outcome, drawn) = task::run(py, hear, move |progress| {
-        let (result, drawn) = fit_by_draws(&ring, &frames, model, settings, |done| progress.tell("draws", done))?;
+        let (result, drawn) = fit_by_draws(&ring, &frames, (model, design(exact_design)), settings, |done| progress.tell("draws", done))?;
         let shown = result.clone();
         Ok((Outcome::of(&result, move || fit_page(&ring, &frames, &shown))?, drawn))
     })?;

@@ -14,7 +14,7 @@ use twin::{Hold, Optics, Ring, Tunes};
 
 use crate::campaign::{campaign, not_modelled, strays};
 use crate::error::CommandError;
-use crate::fit_result::{Monitor, TunesMeasured, faults, lack, monitors};
+use crate::fit_result::{Monitor, TunesMeasured, faults, imperfections, lack, monitors};
 use crate::imperfection::ImperfectionResult;
 use crate::output::{lines, table};
 
@@ -39,7 +39,7 @@ pub struct CheckResult {
     tunes: Option<Design>,
     tunes_measured: TunesMeasured,
     monitors: Vec<Monitor>,
-    /// What the design may be off by throughout the ring, of a batch fit; none without one.
+    /// By what kicks and RF steps are off throughout the ring, of a batch fit; none without one.
     imperfections: Vec<ImperfectionResult>,
     /// Monitors without any reading.
     silent_monitors: Vec<String>,
@@ -129,7 +129,7 @@ impl CheckResult {
             tunes_measured: TunesMeasured::of_recording(&campaign.recording, tunes.map(|t| [t.x, t.y])),
             tunes: tunes.map(|t| Design { x: t.x, y: t.y }),
             monitors: monitors(ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
-            imperfections: imperfections(campaign),
+            imperfections: off_throughout(campaign),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),
             missing: readings.iter().filter(|reading| reading.is_nan()).count() as f64 / readings.len().max(1) as f64,
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],
@@ -138,10 +138,9 @@ impl CheckResult {
 }
 
 /// What the design is off by; none where no batch fit ends.
-fn imperfections(campaign: &Campaign) -> Vec<ImperfectionResult> {
-    let fit = BatchFit::best(campaign, TuneUse::Readings, BaseModel::UNCERTAIN, |_| ());
-    let terms = fit.map(|fit| fit.base).unwrap_or_default();
-    terms.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect()
+fn off_throughout(campaign: &Campaign) -> Vec<ImperfectionResult> {
+    let fit = BatchFit::best(campaign, TuneUse::Readings, BaseModel::SCALES, |_| ());
+    fit.map(|fit| imperfections(&fit, None)).unwrap_or_default()
 }
 
 /// Times in the cycle along a ramp [ms]; none where the machine file has none.

@@ -49,7 +49,7 @@ pub fn compare_recordings(
     let mut vars = |recording: &Recording| -> Result<_, CommandError> {
         let campaign = campaign(ring, recording)?;
         let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, &mut progress)?;
-        Ok(FitResult::of_fit(&campaign, &fit).vars)
+        Ok(FitResult::of_fit(&campaign, &fit, None).vars)
     };
     let (before, after) = (vars(before)?, vars(after)?);
     let widths = ring.parameters.iter().map(|parameter| parameter.prior.width);

@@ -30,6 +30,33 @@ pub enum FitModel {
     Linear,
 }
 
+/// What is known of the design.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Design {
+    /// It may be off throughout the ring, as decks are ([`BaseModel`]).
+    Uncertain,
+    /// It is exact but for the vars: for simulated machines, and to compare with fits that take it so.
+    Exact,
+}
+
+impl Design {
+    /// What a fit has amplitudes of.
+    fn base(self) -> BaseModel {
+        match self {
+            Self::Uncertain => BaseModel::SCALES,
+            Self::Exact => BaseModel::EXACT,
+        }
+    }
+
+    /// What vars imitate.
+    fn imitation(self, ring: &Ring, recording: &Recording) -> Result<Option<Imitation>, CommandError> {
+        match self {
+            Self::Uncertain => Ok(Some(Imitation::from_recording(ring, recording)?)),
+            Self::Exact => Ok(None),
+        }
+    }
+}
+
 /// The page of a fit.
 ///
 /// # Errors
@@ -47,11 +74,13 @@ pub fn fit_page(ring: &Ring, recording: &Recording, result: &FitResult) -> Resul
 pub fn fit_by_steps(
     ring: &Ring,
     recording: &Recording,
+    design: Design,
     progress: impl FnMut(usize),
 ) -> Result<FitResult, CommandError> {
-    let (campaign, fit) = fitted(ring, recording, BaseModel::UNCERTAIN, progress)?;
+    let (campaign, fit) = fitted(ring, recording, design.base(), progress)?;
+    let imitation = design.imitation(ring, recording)?;
     let notes = vec![format!("{} Gauss-Newton steps", fit.steps)];
-    let result = FitResult::of_fit(&campaign, &fit);
+    let result = FitResult::of_fit(&campaign, &fit, imitation.as_ref());
     Ok(FitResult { notes, ..result })
 }
 
@@ -75,14 +104,14 @@ fn fitted(
 pub fn fit_by_draws(
     ring: &Ring,
     recording: &Recording,
-    model: FitModel,
+    (model, design): (FitModel, Design),
     settings: NutsSettings,
     progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<(FitResult, Draws), CommandError> {
     expect_modelled(recording)?;
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
-    let imitation = Imitation::from_recording(ring, recording)?;
-    let (campaign, fit) = fitted(ring, recording, BaseModel::SCALES, |_| ())?;
+    let imitation = design.imitation(ring, recording)?;
+    let (campaign, fit) = fitted(ring, recording, design.base(), |_| ())?;
     let reduced = Reduced::from_fit(campaign, fit)?;
     let ring = &reduced.campaign.ring;
     let is_network = model == FitModel::Resnet;
@@ -103,8 +132,8 @@ pub fn fit_by_draws(
         NutsError::TooMany(_) => CommandError::Input(error.to_string()),
         _ => failed(error.to_string()),
     })?;
-    let draws = imitation.redrawn(&run.draws, settings.seed);
-    let result = FitResult::of_draws(&reduced, word, &run, &draws);
+    let draws = imitation.as_ref().map_or_else(|| run.draws.clone(), |one| one.redrawn(&run.draws, settings.seed));
+    let result = FitResult::of_draws(&reduced, imitation.as_ref(), word, &run, &draws);
     let extrapolated = is_network.then(|| outside(&posterior, &run));
     Ok((FitResult { notes: notes(&run), extrapolated, ..result }, draws))
 }

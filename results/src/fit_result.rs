@@ -180,22 +180,34 @@ impl FitResult {
         }
     }
 
-    /// What the batch fit says.
-    pub fn of_fit(campaign: &Campaign, fit: &BatchFit) -> Self {
+    /// What the batch fit says; where the design may be wrong, with room for what vars imitate of that.
+    pub fn of_fit(campaign: &Campaign, fit: &BatchFit, imitation: Option<&Imitation>) -> Self {
         let bounds = |m: &Marginal| m.mean <= m.lower || m.mean >= m.upper;
-        let each = campaign.ring.var_names().into_iter().zip(&fit.marginals);
-        let vars: Vec<Var> = each.map(|(name, marginal)| Var::of_marginal(name, marginal, bounds(marginal))).collect();
+        let found = DVector::from_iterator(fit.marginals.len(), fit.marginals.iter().map(|m| f64::from(m.mean)));
+        let as_found = || (found.clone(), fit.covariance.clone());
+        let (centre, of_params) = imitation.map_or_else(as_found, |one| one.corrected(&found, &fit.covariance));
+        let var = |(i, (name, found)): (usize, (String, &Marginal))| {
+            let marginal = campaign.prior.marginal(i, centre[i], of_params[(i, i)].sqrt());
+            Var::of_marginal(name, &marginal, bounds(found))
+        };
+        let vars: Vec<Var> = campaign.ring.var_names().into_iter().zip(&fit.marginals).enumerate().map(var).collect();
         Self {
             method: "map",
             model: "twin",
-            covariance: covariance(&vars, |i, j| fit.covariance[(i, j)]),
+            covariance: covariance(&vars, |i, j| of_params[(i, j)]),
             vars,
-            ..Self::of_both(campaign, fit)
+            ..Self::of_both(campaign, fit, imitation)
         }
     }
 
     /// What draws of the posterior say, which a run gave.
-    pub fn of_draws(reduced: &Reduced, model: &'static str, run: &NutsRun, draws: &Draws) -> Self {
+    pub fn of_draws(
+        reduced: &Reduced,
+        imitation: Option<&Imitation>,
+        model: &'static str,
+        run: &NutsRun,
+        draws: &Draws,
+    ) -> Self {
         let sampled = Sampled::of(draws);
         let vars: Vec<Var> = sampled.summary.iter().map(Var::of_draws).collect();
         let covariance = sampled.covariance();
@@ -205,12 +217,12 @@ impl FitResult {
             covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
             vars,
             nuts: Some(Sampling::of(&Sampled::of(&run.draws), run)),
-            ..Self::of_both(&reduced.campaign, &reduced.fit)
+            ..Self::of_both(&reduced.campaign, &reduced.fit, imitation)
         }
     }
 
     /// What the batch fit says and the draws leave as it is; without optics where the ring as fitted is unstable.
-    fn of_both(campaign: &Campaign, fit: &BatchFit) -> Self {
+    fn of_both(campaign: &Campaign, fit: &BatchFit, imitation: Option<&Imitation>) -> Self {
         let ([x, y], ring) = (&fit.tunes, &campaign.ring);
         let calibrated = fit.optics(campaign).ok();
         let sigma = calibrated.as_ref().map(|(_, (_, tunes))| *tunes);
@@ -232,7 +244,7 @@ impl FitResult {
             calibrated,
             lack: fit.lack.map(|lack| lack.to_string()),
             monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
-            imperfections: fit.base.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect(),
+            imperfections: imperfections(fit, imitation),
             log_evidence: None,
             timing: None,
             nuts: None,
@@ -304,6 +316,13 @@ impl fmt::Display for FitResult {
         self.timing.map_or(Ok(()), |timing| write!(f, "\n{timing}"))?;
         self.notes.iter().try_for_each(|note| write!(f, "\n{}", fill(note)))
     }
+}
+
+/// What the design is off by throughout the ring.
+pub(crate) fn imperfections(fit: &BatchFit, imitation: Option<&Imitation>) -> Vec<ImperfectionResult> {
+    let found = DVector::from_column_slice(&fit.map_params);
+    let of_magnets = imitation.map(|one| one.amplitudes(&found, &fit.covariance)).unwrap_or_default();
+    of_magnets.iter().chain(&fit.base).map(|term| ImperfectionResult::from(&term.imperfection())).collect()
 }
 
 /// Centre and covariance of each theta, with room for what the design is off by.

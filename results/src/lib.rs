@@ -6,12 +6,12 @@
 //!
 //! ```
 //! use inference::Recording;
-//! use results::fit_by_steps;
+//! use results::{Design, fit_by_steps};
 //! use twin::Ring;
 //!
 //! let ring = Ring::booster();
 //! let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../recordings/paper-vars");
-//! let fit = fit_by_steps(&ring, &Recording::read(folder.as_ref(), &ring)?, |_| ())?;
+//! let fit = fit_by_steps(&ring, &Recording::read(folder.as_ref(), &ring)?, Design::Uncertain, |_| ())?;
 //! assert_eq!(fit.vars.len(), 48);
 //! assert!(fit.to_string().contains("method map, model twin"));
 //! assert_eq!(serde_json::to_value(&fit)?["method"], "map");
@@ -47,7 +47,7 @@ pub use check_result::CheckResult;
 pub use compare::{compare_matrices, compare_recordings};
 pub use diagnosis_result::{DiagnosisResult, diagnosis_page};
 pub use error::CommandError;
-pub use fit::{FitModel, fit_by_draws, fit_by_steps, fit_page};
+pub use fit::{Design, FitModel, fit_by_draws, fit_by_steps, fit_page};
 pub use fit_result::{FitResult, Monitor, Timing, Tunes, TunesMeasured, Var, state_word};
 pub use frames_result::Written;
 pub use import_result::Imported;

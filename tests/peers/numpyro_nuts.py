@@ -215,7 +215,7 @@ def fit(orbitcal, recording, model):
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, "answer.json")
         settings = ["--chains", CHAINS, "--warm-up", WARM_UP, "--draws", DRAWS, "--seed", SEED]
-        command = [orbitcal, "fit", recording, "--method", "nuts", "--model", model, *settings]
+        command = [orbitcal, "fit", recording, "--method", "nuts", "--exact-design", "--model", model, *settings]
         command += ["--json", answer, "--save-draws", folder, "--quiet"]
         before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
         subprocess.run([str(word) for word in command], check=True)

@@ -6,7 +6,7 @@ use indicatif::ProgressBar;
 use inference::Recording;
 use inference::nuts::NutsSettings;
 use measured::Folder;
-use results::{FitResult, fit_by_draws, fit_by_steps, fit_page, output};
+use results::{Design, FitResult, fit_by_draws, fit_by_steps, fit_page, output};
 use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine_with, matrix, progress, recording};
@@ -51,9 +51,15 @@ fn check(options: &Fit) -> Result<(), CommandError> {
     Ok(options.save_draws.as_deref().map_or(Ok(()), output::check_folder)?)
 }
 
+fn design(options: &Fit) -> Design {
+    if options.exact_design { Design::Exact } else { Design::Uncertain }
+}
+
 fn with_spinner(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
     let spinner = if options.common.quiet { ProgressBar::hidden() } else { ProgressBar::new_spinner() };
-    let result = fit_by_steps(ring, recording, |step| spinner.set_message(format!("Gauss-Newton step {step}")));
+    let result = fit_by_steps(ring, recording, design(options), |step| {
+        spinner.set_message(format!("Gauss-Newton step {step}"));
+    });
     spinner.finish_and_clear();
     result
 }
@@ -61,7 +67,7 @@ fn with_spinner(options: &Fit, ring: &Ring, recording: &Recording) -> Result<Fit
 fn with_bar(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResult, CommandError> {
     let settings: NutsSettings = options.sampling.into();
     let bar = progress(settings.chains * (settings.warm_up + settings.draws), "draws", options.common.quiet);
-    let sampled = fit_by_draws(ring, recording, options.model.into(), settings, |done| {
+    let sampled = fit_by_draws(ring, recording, (options.model.into(), design(options)), settings, |done| {
         bar.set_position(done as u64);
         ControlFlow::Continue(())
     });

@@ -110,9 +110,9 @@ class Calibration:
         return _below(recording.ring, params, last.centre, last.params_sigma)
 
     def _nuts(self, recording: Recording, params: np.ndarray, seed: int) -> list[float]:
-        # one chain, so that a worker takes one core
+        # one chain, so that a worker takes one core; the design is exact, as the campaign's is
         ring, measured = recording.ring._ring, recording._recording
-        _, drawn = _orbitcal.sample(ring, measured, "green", 1, 300, self.draws, seed, None)
+        _, drawn = _orbitcal.sample(ring, measured, "green", 1, 300, self.draws, seed, True, None)
         return _place((np.log(drawn["vars"][0]) < params).sum(axis=0), self.draws, seed)
 
 

@@ -14,7 +14,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
         0 => "Nothing beyond two standard deviations.",
         _ => {
             "Every machine has imperfections that are nobody's discovery: noise, scatter of strengths, gains and rolls, common factors. They are part of the \
-             model, with these sizes. A kick constant and the gain of all monitors cannot be told apart by kicks alone: each gets half."
+             model, with these sizes. A kick constant and the gain of all monitors cannot be told apart by kicks alone: the kick constant gets most."
         }
     };
     let header = ["what", "size", "ordinary", ""];
