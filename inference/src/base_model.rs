@@ -97,7 +97,7 @@ impl BaseTerm {
     /// Standard deviation of its amplitude, in the unit of the kind.
     pub const fn width(self) -> f64 {
         match self {
-            Self::DipoleGradient => 2e-3,
+            Self::DipoleGradient => 1e-3,
             Self::DipoleEdge => 5e-3,
             Self::Momentum => 1e-3,
             Self::RfStep => 0.03,

@@ -14,7 +14,7 @@ use twin::{Hold, Optics, Ring, Tunes};
 
 use crate::campaign::{campaign, not_modelled, strays};
 use crate::error::CommandError;
-use crate::fit_result::{Monitor, TunesMeasured, faults, imperfections, lack, monitors};
+use crate::fit_result::{Monitor, TunesMeasured, faults, lack, monitors};
 use crate::imperfection::ImperfectionResult;
 use crate::output::{lines, table};
 
@@ -140,7 +140,8 @@ impl CheckResult {
 /// What the design is off by; none where no batch fit ends.
 fn off_throughout(campaign: &Campaign) -> Vec<ImperfectionResult> {
     let fit = BatchFit::best(campaign, TuneUse::Readings, BaseModel::SCALES, |_| ());
-    fit.map(|fit| imperfections(&fit, None)).unwrap_or_default()
+    let terms = fit.map(|fit| fit.base).unwrap_or_default();
+    terms.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect()
 }
 
 /// Times in the cycle along a ramp [ms]; none where the machine file has none.

@@ -133,7 +133,7 @@ pub fn fit_by_draws(
         _ => failed(error.to_string()),
     })?;
     let draws = imitation.as_ref().map_or_else(|| run.draws.clone(), |one| one.redrawn(&run.draws, settings.seed));
-    let result = FitResult::of_draws(&reduced, imitation.as_ref(), word, &run, &draws);
+    let result = FitResult::of_draws(&reduced, word, &run, &draws);
     let extrapolated = is_network.then(|| outside(&posterior, &run));
     Ok((FitResult { notes: notes(&run), extrapolated, ..result }, draws))
 }

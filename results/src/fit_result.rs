@@ -11,7 +11,7 @@ use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{BatchFit, Campaign, Draws, FittedOptics, Imitation, Lack, Prior, Recording, Reduced, Summary};
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 use schemars::JsonSchema;
 use serde::Serialize;
 use studies::Sampled;
@@ -136,7 +136,7 @@ fn latest(recording: &Recording) -> Cow<'_, Recording> {
 
 impl FitResult {
     /// What a core says after its last frame, here or on a device, whose params walked by so much; the core takes the design for exact, and here its
-    /// vars are corrected by what they may imitate ([`Imitation`]).
+    /// error bars get room for what vars may imitate ([`Imitation`]).
     pub fn of_core(
         model: &'static str,
         ring: &Ring,
@@ -146,8 +146,9 @@ impl FitResult {
         timing: Timing,
     ) -> Self {
         let prior = Prior::from_ring(ring);
-        let (centre, of_params) = corrected(ring, recording, last);
-        let marginals = (0..prior.len()).map(|i| prior.marginal(i, centre[i], of_params[(i, i)].sqrt()));
+        let of_params = widened(ring, recording, last);
+        let marginal = |i: usize| prior.marginal(i, last.centre[i].into(), of_params[(i, i)].sqrt());
+        let marginals = (0..prior.len()).map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
         let vars: Vec<Var> = each.map(|((name, m), clipped)| Var::of_marginal(name, &m, *clipped)).collect();
         // vars that walk are those of the last frames, and so are their tunes
@@ -183,11 +184,9 @@ impl FitResult {
     /// What the batch fit says; where the design may be wrong, with room for what vars imitate of that.
     pub fn of_fit(campaign: &Campaign, fit: &BatchFit, imitation: Option<&Imitation>) -> Self {
         let bounds = |m: &Marginal| m.mean <= m.lower || m.mean >= m.upper;
-        let found = DVector::from_iterator(fit.marginals.len(), fit.marginals.iter().map(|m| f64::from(m.mean)));
-        let as_found = || (found.clone(), fit.covariance.clone());
-        let (centre, of_params) = imitation.map_or_else(as_found, |one| one.corrected(&found, &fit.covariance));
+        let of_params = imitation.map_or_else(|| fit.covariance.clone(), |one| one.widened(&fit.covariance));
         let var = |(i, (name, found)): (usize, (String, &Marginal))| {
-            let marginal = campaign.prior.marginal(i, centre[i], of_params[(i, i)].sqrt());
+            let marginal = campaign.prior.marginal(i, found.mean.into(), of_params[(i, i)].sqrt());
             Var::of_marginal(name, &marginal, bounds(found))
         };
         let vars: Vec<Var> = campaign.ring.var_names().into_iter().zip(&fit.marginals).enumerate().map(var).collect();
@@ -196,18 +195,12 @@ impl FitResult {
             model: "twin",
             covariance: covariance(&vars, |i, j| of_params[(i, j)]),
             vars,
-            ..Self::of_both(campaign, fit, imitation)
+            ..Self::of_both(campaign, fit)
         }
     }
 
     /// What draws of the posterior say, which a run gave.
-    pub fn of_draws(
-        reduced: &Reduced,
-        imitation: Option<&Imitation>,
-        model: &'static str,
-        run: &NutsRun,
-        draws: &Draws,
-    ) -> Self {
+    pub fn of_draws(reduced: &Reduced, model: &'static str, run: &NutsRun, draws: &Draws) -> Self {
         let sampled = Sampled::of(draws);
         let vars: Vec<Var> = sampled.summary.iter().map(Var::of_draws).collect();
         let covariance = sampled.covariance();
@@ -217,12 +210,12 @@ impl FitResult {
             covariance: covariance.row_iter().map(|row| row.iter().copied().collect()).collect(),
             vars,
             nuts: Some(Sampling::of(&Sampled::of(&run.draws), run)),
-            ..Self::of_both(&reduced.campaign, &reduced.fit, imitation)
+            ..Self::of_both(&reduced.campaign, &reduced.fit)
         }
     }
 
     /// What the batch fit says and the draws leave as it is; without optics where the ring as fitted is unstable.
-    fn of_both(campaign: &Campaign, fit: &BatchFit, imitation: Option<&Imitation>) -> Self {
+    fn of_both(campaign: &Campaign, fit: &BatchFit) -> Self {
         let ([x, y], ring) = (&fit.tunes, &campaign.ring);
         let calibrated = fit.optics(campaign).ok();
         let sigma = calibrated.as_ref().map(|(_, (_, tunes))| *tunes);
@@ -244,7 +237,7 @@ impl FitResult {
             calibrated,
             lack: fit.lack.map(|lack| lack.to_string()),
             monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
-            imperfections: imperfections(fit, imitation),
+            imperfections: fit.base.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect(),
             log_evidence: None,
             timing: None,
             nuts: None,
@@ -318,26 +311,15 @@ impl fmt::Display for FitResult {
     }
 }
 
-/// What the design is off by throughout the ring.
-pub(crate) fn imperfections(fit: &BatchFit, imitation: Option<&Imitation>) -> Vec<ImperfectionResult> {
-    let found = DVector::from_column_slice(&fit.map_params);
-    let of_magnets = imitation.map(|one| one.amplitudes(&found, &fit.covariance)).unwrap_or_default();
-    of_magnets.iter().chain(&fit.base).map(|term| ImperfectionResult::from(&term.imperfection())).collect()
-}
-
-/// Centre and covariance of each theta, with room for what the design is off by.
-fn corrected(ring: &Ring, recording: &Recording, last: &EstimateRecord) -> (DVector<f64>, DMatrix<f64>) {
-    let centre = DVector::from_iterator(last.centre.len(), last.centre.iter().copied().map(f64::from));
+/// Covariance of each theta, with room for magnets that are off throughout the ring.
+fn widened(ring: &Ring, recording: &Recording, last: &EstimateRecord) -> DMatrix<f64> {
     let of_params = |i: usize, j: usize| match i == j {
         true => f64::from(last.params_sigma[i]).powi(2),
         false => f64::from(last.covariance_of(i, j)) / f64::from(last.mean[i] * last.mean[j]),
     };
-    let covariance = DMatrix::from_fn(centre.len(), centre.len(), of_params);
-    match Imitation::from_recording(ring, recording) {
-        Ok(imitation) => imitation.corrected(&centre, &covariance),
-        // a core of a design without a stable orbit cannot be made
-        Err(_) => (centre, covariance),
-    }
+    let covariance = DMatrix::from_fn(last.centre.len(), last.centre.len(), of_params);
+    // a core of a design without a stable orbit cannot be made
+    Imitation::from_recording(ring, recording).map_or_else(|_| covariance.clone(), |one| one.widened(&covariance))
 }
 
 /// What a recording lacks to say anything, by what was read and what was moved.
