@@ -151,6 +151,11 @@ impl Imperfection {
     pub fn is_large(&self) -> bool {
         self.scatter > LARGE * self.ordinary
     }
+
+    /// True for kicks that are off together by far more than they scatter in an ordinary ring: a kick constant, or the scale of the monitors.
+    pub fn is_kick_constant(&self) -> bool {
+        self.word == Kind::CorrectorGain(0).word() && self.mean.abs() > LARGE * self.ordinary
+    }
 }
 
 /// What would be named.

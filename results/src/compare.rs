@@ -37,7 +37,8 @@ pub fn compare_matrices(
     Ok(Comparison::of(all, cables.chain(changes.others.iter().map(OtherChange::of)).collect()))
 }
 
-/// Two recordings of a ring; `progress` hears the number of each step. Each is fitted by itself; where a var is known no better than half its prior, the prior would hide a change.
+/// Two recordings of a ring; `progress` hears the number of each step. Each is fitted by itself, with a design that
+/// is exact, since both share it; where a var is known no better than half its prior, the prior would hide a change.
 ///
 /// # Errors
 /// [`CommandError`].

@@ -185,7 +185,12 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
         format!("{} scatter by {scatter}, in an ordinary ring by {ordinary}", members(one.word, &one.class))
     });
     let large: Vec<String> = if fitted.has_ended { large.collect() } else { Vec::new() };
+    let constant = |one: &Imperfection| format!("kick constant, {} {:+.1} %", one.class, 1e2 * one.mean);
+    let constants: Vec<String> =
+        diagnosis.imperfections.iter().filter(|one| one.is_kick_constant()).map(constant).collect();
+    let off = (!constants.is_empty()).then(|| format!("off throughout the ring: {}", constants.join(", ")));
     let parts: Vec<String> = (doubt.into_iter())
+        .chain(off)
         .chain(nothing.then(|| "nothing stands out of what its kind does everywhere".to_owned()))
         .chain(findings.iter().take(SAID).map(|finding| finding.sentence.clone()))
         .chain((more > 0).then(|| format!("{more} more are listed")))

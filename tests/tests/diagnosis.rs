@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Term, Verdict, candidates, sample, scan};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
-use inference::{Campaign, Recording};
+use inference::{Campaign, Imperfection, Measure, Recording};
 use nalgebra::DVector;
 use system_tests::repository;
 use twin::{Effect, EffectKind, Machine, Measured, Rf, Ring};
