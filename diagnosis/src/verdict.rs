@@ -28,7 +28,7 @@ use super::term::Term;
 use super::tested::Tested;
 use super::transients::Transient;
 use super::widths;
-use inference::{Imperfection, Measure, POSITION};
+use inference::{Imperfection, Measure, POSITION, THROUGHOUT};
 
 /// The result of a diagnosis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -459,7 +459,7 @@ pub fn sentence(
     } else {
         said.insert(0, text);
     }
-    said.splice(0..0, Imperfection::list("off throughout the ring", &common));
+    said.splice(0..0, Imperfection::list(THROUGHOUT, &common));
     said.extend(Imperfection::list("larger than ordinary", &scatters));
     said.extend(remarks(data));
     capitalised(&said.join("; "))

@@ -73,7 +73,7 @@ mod tests {
         let last = serve(&mut source, &mut Sinks::default(), &stop, || {}).unwrap().unwrap();
         assert_eq!((last.frames, last.remarked), (60, Remarked { put_aside_frames: 2, ..Remarked::default() }));
         let (quality, timing) = (source.quality(), source.times.quantiles());
-        let result = FitResult::of_core("green", &ring, (&recording, Walk::NONE), &last, quality, timing);
+        let result = FitResult::of_core("green", &ring, (&recording, Walk::NONE), &last, quality, timing).unwrap();
         assert_eq!(result.frames, 58);
         assert!(result.to_string().contains(", 2 frames put aside"), "{result}");
     }

@@ -1,7 +1,6 @@
-//! What the design may be wrong in throughout the ring: two decks of one machine differ so, and chi-square does not tell, since vars imitate it.
+//! What the design may be wrong in throughout the ring: two decks of one machine differ so. Chi-square does not tell it of magnets, since vars imitate them.
 //!
-//! Each term has one amplitude, normal about 0 with the width by which decks, codes and magnetic measurements of one machine differ. An exact design has no
-//! terms.
+//! Each term has one amplitude, normal about 0 with the width by which decks, codes and magnetic measurements of one machine differ.
 //!
 //! Source of the widths: two decks of the AGS Booster, whose dipoles differ by a body gradient of 0.7 mrad/m, whose energies by 4 % and whose kick constants by 28 %.
 
@@ -51,7 +50,7 @@ impl FittedTerm {
     }
 }
 
-/// The properties that a fit takes for uncertain.
+/// The properties that have amplitudes; those of an exact design are none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BaseModel {
     terms: &'static [BaseTerm],
@@ -106,7 +105,7 @@ impl BaseTerm {
     }
 
     /// The correctors that it is of, `H` or `V`; `all` of what has no plane.
-    pub const fn place(self) -> &'static str {
+    const fn place(self) -> &'static str {
         match self {
             Self::Kick(Plane::X) => "H",
             Self::Kick(Plane::Y) => "V",
@@ -146,12 +145,13 @@ impl BaseModel {
     pub const EXACT: Self = Self { terms: &[] };
 
     /// What changes the ring itself: vars imitate it.
-    pub const MAGNETS: Self = Self { terms: &[BaseTerm::DipoleGradient, BaseTerm::DipoleEdge, BaseTerm::Momentum] };
+    pub(crate) const MAGNETS: Self =
+        Self { terms: &[BaseTerm::DipoleGradient, BaseTerm::DipoleEdge, BaseTerm::Momentum] };
     /// What scales kicks and RF offsets: vars cannot imitate it, and a fit knows it.
     pub const SCALES: Self = Self { terms: &[BaseTerm::RfStep, BaseTerm::Kick(Plane::X), BaseTerm::Kick(Plane::Y)] };
 
     /// Its terms.
-    pub fn terms(&self) -> &'static [BaseTerm] {
+    pub(crate) fn terms(&self) -> &'static [BaseTerm] {
         self.terms
     }
 

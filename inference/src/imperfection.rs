@@ -5,6 +5,9 @@ use twin::{Measured, Unit};
 /// Unit of positions at the monitors [m], shown in mm.
 pub const POSITION: Unit = Unit { symbol: "m", shown: "mm", factor: 1e3 };
 
+/// How a sentence begins that names what all magnets or instruments are off by.
+pub const THROUGHOUT: &str = "off throughout the ring";
+
 /// What a number is of a family.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Measure {

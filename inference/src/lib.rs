@@ -46,8 +46,8 @@ pub use campaign::{
 pub use diagnostics::{mcse_sd, quantile};
 pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
 pub use imitation::Imitation;
-pub use imperfection::{Imperfection, Measure, POSITION};
-pub use map_fit::{BatchError, BatchFit, FittedOptics, FittedTune, Lack, TuneUse};
+pub use imperfection::{Imperfection, Measure, POSITION, THROUGHOUT};
+pub use map_fit::{BatchError, BatchFit, FittedTune, Lack, OpticsFunctions, TuneUse};
 pub use model::{GreenModel, ResnetModel, ResponseModel};
 pub use optimise::{End, Limits, Objective, OptimiseError, Quadratic, minimise};
 pub use posterior::{Laplace, LaplaceError, Posterior};

@@ -155,7 +155,7 @@ impl BatchFit {
 }
 
 /// Optics functions of a fit, and their standard deviations.
-pub type FittedOptics = (CalibratedOptics, (Vec<Twiss>, Tunes));
+pub type OpticsFunctions = (CalibratedOptics, (Vec<Twiss>, Tunes));
 
 impl BatchFit {
     /// Theta and, after it, the amplitudes of the base model's terms.
@@ -168,7 +168,7 @@ impl BatchFit {
     ///
     /// # Errors
     /// [`OrbitError`] of unstable motion.
-    pub fn optics(&self, campaign: &Campaign) -> Result<FittedOptics, OrbitError> {
+    pub fn optics(&self, campaign: &Campaign) -> Result<OpticsFunctions, OrbitError> {
         let optics = CalibratedOptics::of(&campaign.ring, &self.map_params, &campaign.supplies)?;
         let sigma = optics.sigma(&self.covariance);
         Ok((optics, sigma))

@@ -9,7 +9,6 @@ mod linear;
 mod resnet;
 
 use nalgebra::DMatrix;
-use serde::Serialize;
 use twin::{OrbitError, Ring, VariedOptics, VariedRing};
 
 use crate::stream::StreamError;
@@ -149,7 +148,7 @@ impl ResponseModel {
 }
 
 /// What a model predicts, or the derivative of a function of it.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone)]
 pub struct Prediction {
     /// Rows monitors, columns correctors and the RF.
     pub response: DMatrix<f64>,

@@ -42,10 +42,8 @@ pub struct Reduced {
 /// Derivative of what a model predicts by one term of the base model, at the fit.
 #[derive(Debug, Clone, Serialize)]
 struct BaseSlope {
-    /// As [`Prediction::response`].
+    /// As [`Prediction::response`]; the tunes follow the magnets alone, which are exact here.
     response: DMatrix<f64>,
-    /// Of the tunes.
-    tunes: Vector2<f64>,
     /// Amplitude at the fit.
     value: f64,
     /// One over the variance of its prior.
@@ -79,7 +77,7 @@ struct Form {
 struct Base {
     slopes: Vec<BaseSlope>,
     /// What a unit of each adds to the derivative of chi-square by the prediction.
-    weights: Vec<Prediction>,
+    weights: Vec<DMatrix<f64>>,
     /// Inverse of half the second derivative of chi-square with respect to the amplitudes.
     inverse: DMatrix<f64>,
 }
@@ -112,9 +110,12 @@ impl Reduced {
             row += (&response * drive.kick.push(drive.rf_offset).component_mul(&factors)).transpose();
         }
         let slope = |(at, fitted): (usize, &FittedTerm)| {
-            let (mut response, tunes) = linearised.at_mean.slope(vars + at);
+            let mut response = DMatrix::zeros(readings.ncols(), factors.len());
+            for (b, mut row) in response.row_iter_mut().enumerate() {
+                row.copy_from(&linearised.at_mean.slopes_at(b).row(vars + at));
+            }
             response.column_iter_mut().zip(factors.iter()).for_each(|(mut column, factor)| column /= *factor);
-            BaseSlope { response, tunes, value: fitted.measured.value, precision: fitted.term.width().powi(-2) }
+            BaseSlope { response, value: fitted.measured.value, precision: fitted.term.width().powi(-2) }
         };
         let base = fit.base.iter().enumerate().map(slope).collect();
         Ok(Self { campaign, fit, readings, factors, base })
@@ -162,7 +163,7 @@ impl Reduced {
         let ring = &self.campaign.ring;
         let meters = if tunes == TuneUse::Readings { self.campaign.meters.clone() } else { [None, None] };
         Readings {
-            base: Base::eliminated(base.to_vec(), &forms, &meters),
+            base: Base::eliminated(base.to_vec(), &forms),
             forms,
             meters,
             supplies: self.strength(&[]),
@@ -234,12 +235,11 @@ impl Readings {
     /// Chi-square of a prediction, and its derivative with respect to each number of it.
     pub fn chi_square(&self, predicted: &Prediction) -> (f64, Prediction) {
         let (fitted, mut weights) = self.as_fitted(predicted);
-        let slope = self.base.pull(&weights);
+        let slope = self.base.pull(&weights.response);
         let amplitudes = -(&self.base.inverse * &slope);
         // the derivative is linear in the prediction
         for (more, &amplitude) in self.base.weights.iter().zip(amplitudes.iter()) {
-            weights.response.zip_apply(&more.response, |weight, more| *weight += more * amplitude);
-            weights.tunes.iter_mut().zip(more.tunes).for_each(|(weight, more)| *weight += more * amplitude);
+            weights.response.zip_apply(more, |weight, more| *weight += more * amplitude);
         }
         (fitted + self.base.cost() + slope.dot(&amplitudes), weights)
     }
@@ -279,7 +279,7 @@ impl Readings {
         for (b, (form, of_quadrupoles)) in self.forms.iter().zip(&jacobian).enumerate() {
             let j = self.gather_columns(of_quadrupoles);
             for (mut row, base) in mixed.row_iter_mut().zip(of_base) {
-                row += base.response.row(b) * &j / 2.0;
+                row += base.row(b) * &j / 2.0;
             }
             curvature += j.tr_mul(&(&form.gram * &j));
         }
@@ -287,9 +287,6 @@ impl Readings {
         for (plane, meter) in self.meters.iter().enumerate() {
             let Some(meter) = meter else { continue };
             let slope = tune_slopes.row(plane).transpose();
-            for (mut row, base) in mixed.row_iter_mut().zip(of_base) {
-                row += slope.transpose() * (base.tunes[plane] / 2.0);
-            }
             curvature.ger(meter.whiten.column(0).norm_squared(), &slope, &slope, 1.0);
         }
         Ok(curvature - mixed.tr_mul(&(&self.base.inverse * &mixed)))
@@ -306,8 +303,8 @@ impl Readings {
 }
 
 impl Base {
-    fn eliminated(slopes: Vec<BaseSlope>, forms: &[Form], meters: &[Option<Meter>; 2]) -> Self {
-        let weights: Vec<Prediction> = slopes.iter().map(|one| one.weights(forms, meters)).collect();
+    fn eliminated(slopes: Vec<BaseSlope>, forms: &[Form]) -> Self {
+        let weights: Vec<DMatrix<f64>> = slopes.iter().map(|one| one.weights(forms)).collect();
         let normal = DMatrix::from_fn(slopes.len(), slopes.len(), |i, j| {
             let prior = if i == j { slopes[i].precision } else { 0.0 };
             slopes[i].along(&weights[j]) / 2.0 + prior
@@ -317,7 +314,7 @@ impl Base {
     }
 
     /// Half the derivative of chi-square by the amplitudes, given that by the prediction.
-    fn pull(&self, weights: &Prediction) -> DVector<f64> {
+    fn pull(&self, weights: &DMatrix<f64>) -> DVector<f64> {
         let each = self.slopes.iter().map(|one| one.along(weights) / 2.0 + one.precision * one.value);
         DVector::from_iterator(self.slopes.len(), each)
     }
@@ -329,19 +326,18 @@ impl Base {
 }
 
 impl BaseSlope {
-    /// What a unit of the amplitude changes of a function of the prediction with these derivatives.
-    fn along(&self, weights: &Prediction) -> f64 {
-        self.response.dot(&weights.response) + self.tunes.dot(&Vector2::from(weights.tunes))
+    /// What a unit of the amplitude changes of a function of the response with these derivatives.
+    fn along(&self, weights: &DMatrix<f64>) -> f64 {
+        self.response.dot(weights)
     }
 
-    /// What a unit of the amplitude adds to the derivative of chi-square by the prediction.
-    fn weights(&self, forms: &[Form], meters: &[Option<Meter>; 2]) -> Prediction {
-        let mut response = self.response.clone();
+    /// What a unit of the amplitude adds to the derivative of chi-square by the response.
+    fn weights(&self, forms: &[Form]) -> DMatrix<f64> {
+        let mut weights = self.response.clone();
         for (b, form) in forms.iter().enumerate() {
-            response.set_row(b, &(self.response.row(b) * &form.gram * 2.0));
+            weights.set_row(b, &(self.response.row(b) * &form.gram * 2.0));
         }
-        let squared = |plane: usize| meters[plane].as_ref().map_or(0.0, |meter| meter.whiten.column(0).norm_squared());
-        Prediction { response, tunes: [0, 1].map(|plane| 2.0 * self.tunes[plane] * squared(plane)) }
+        weights
     }
 }
 

@@ -72,10 +72,22 @@ fn assert_same_terms(campaign: &Campaign, base: BaseModel) {
     let readings = Readings::of_frames(&reduced, &model, TuneUse::Readings);
     let curvature = readings.curvature(&model, &reduced.fit.map_params).unwrap();
     let posterior = Posterior::new(model, readings, reduced.campaign.prior.clone());
-    let (_, gradient) = posterior.of_params(&reduced.fit.map_params).unwrap();
+    let (_, slope) = posterior.of_params(&reduced.fit.map_params).unwrap();
     let covariance = &reduced.fit.covariance;
-    let step = covariance * DVector::from_vec(gradient);
+    let step = covariance * DVector::from_vec(slope);
     let information = covariance.clone().cholesky().unwrap().inverse();
+    // where the eliminated amplitudes are not 0: the gradient is that of the density
+    let away: Vec<f64> = (0..48).map(|i| reduced.fit.map_params[i] + 3.0 * covariance[(i, i)].sqrt()).collect();
+    let (_, gradient) = posterior.of_params(&away).unwrap();
+    for i in [0, 13, 47] {
+        let near = |step: f64| {
+            let mut params = away.clone();
+            params[i] += step;
+            posterior.of_params(&params).unwrap().0
+        };
+        let difference = (near(1e-6) - near(-1e-6)) / 2e-6;
+        assert!((gradient[i] / difference - 1.0).abs() < 1e-3, "{i}: {} {difference}", gradient[i]);
+    }
     for i in 0..48 {
         let moved = step[i].abs() / covariance[(i, i)].sqrt();
         assert!(moved < 0.03, "{i}: {moved} sigma"); // what the reduction to quadratic forms leaves out

@@ -10,7 +10,7 @@ use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use results::{
-    Design, CommandError, Comparison, DiagnosedMatrix, DiagnosisResult, FitModel, FittedMatrix, compare_matrices,
+    CommandError, Comparison, Design, DiagnosedMatrix, DiagnosisResult, FitModel, FittedMatrix, compare_matrices,
     compare_recordings, comparison_page, diagnosis_page, fit_by_draws, fit_by_steps, fit_page,
 };
 
@@ -57,7 +57,8 @@ pub fn fit(
             expect_no_rf(rf)?;
             let (ring, frames) = (ring.ring.clone(), Arc::clone(frames));
             task::run(py, hear, move |progress| {
-                let result = fit_by_steps(&ring, &frames, design(exact_design), |step| progress.step("Gauss-Newton", step))?;
+                let result =
+                    fit_by_steps(&ring, &frames, design(exact_design), |step| progress.step("Gauss-Newton", step))?;
                 let shown = result.clone();
                 Outcome::of(&result, move || fit_page(&ring, &frames, &shown))
             })
@@ -104,7 +105,8 @@ pub fn sample<'py>(
     let (ring, frames) = (ring.ring.clone(), Arc::clone(frames));
     let settings = NutsSettings { chains, warm_up, draws, seed };
     let (outcome, drawn) = task::run(py, hear, move |progress| {
-        let (result, drawn) = fit_by_draws(&ring, &frames, (model, design(exact_design)), settings, |done| progress.tell("draws", done))?;
+        let (result, drawn) =
+            fit_by_draws(&ring, &frames, (model, design(exact_design)), settings, |done| progress.tell("draws", done))?;
         let shown = result.clone();
         Ok((Outcome::of(&result, move || fit_page(&ring, &frames, &shown))?, drawn))
     })?;

@@ -36,7 +36,7 @@ pub struct CheckResult {
     cycle_times_ms: Vec<f64>,
     settings: Settings,
     noise: Noise,
-    tunes: Option<Design>,
+    tunes: Option<DesignTunes>,
     tunes_measured: TunesMeasured,
     monitors: Vec<Monitor>,
     /// By what kicks and RF steps are off throughout the ring, of a batch fit; none without one.
@@ -82,7 +82,7 @@ struct PlaneNoise {
 
 /// Tunes of the ring as designed, at the recording's mean currents.
 #[derive(Debug, Serialize, JsonSchema)]
-struct Design {
+struct DesignTunes {
     x: f64,
     y: f64,
 }
@@ -127,7 +127,7 @@ impl CheckResult {
             settings: Settings::of(campaign),
             noise: Noise::of(campaign),
             tunes_measured: TunesMeasured::of_recording(&campaign.recording, tunes.map(|t| [t.x, t.y])),
-            tunes: tunes.map(|t| Design { x: t.x, y: t.y }),
+            tunes: tunes.map(|t| DesignTunes { x: t.x, y: t.y }),
             monitors: monitors(ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
             imperfections: off_throughout(campaign),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),

@@ -51,7 +51,7 @@ impl Design {
     /// What vars imitate.
     fn imitation(self, ring: &Ring, recording: &Recording) -> Result<Option<Imitation>, CommandError> {
         match self {
-            Self::Uncertain => Ok(Some(Imitation::from_recording(ring, recording)?)),
+            Self::Uncertain => Ok(Some(Imitation::new(ring, recording)?)),
             Self::Exact => Ok(None),
         }
     }
@@ -110,8 +110,8 @@ pub fn fit_by_draws(
 ) -> Result<(FitResult, Draws), CommandError> {
     expect_modelled(recording)?;
     let failed = |error: String| CommandError::Other(format!("{}: {error}", recording.name));
-    let imitation = design.imitation(ring, recording)?;
     let (campaign, fit) = fitted(ring, recording, design.base(), |_| ())?;
+    let imitation = design.imitation(ring, recording)?;
     let reduced = Reduced::from_fit(campaign, fit)?;
     let ring = &reduced.campaign.ring;
     let is_network = model == FitModel::Resnet;

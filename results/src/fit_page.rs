@@ -4,7 +4,7 @@
 
 use core::f64::consts::TAU;
 
-use inference::FittedOptics;
+use inference::OpticsFunctions;
 use report::{Axes, Band, Figure, Page, Reference, Section, Series, Table};
 use twin::{CalibratedOptics, Hold, Optics, OrbitError, Ring, Tunes, Twiss};
 
@@ -46,7 +46,7 @@ pub fn page(ring: &Ring, result: &FitResult) -> Result<Option<Page>, OrbitError>
 }
 
 impl<'r> Calibrated<'r> {
-    fn of(ring: &'r Ring, fitted: &'r FittedOptics, result: &'r FitResult) -> Result<Self, OrbitError> {
+    fn of(ring: &'r Ring, fitted: &'r OpticsFunctions, result: &'r FitResult) -> Result<Self, OrbitError> {
         let (optics, sigma) = fitted;
         let design = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
         let design = (design.twiss()?, design.tunes()?);
@@ -189,5 +189,6 @@ fn strengths(result: &FitResult) -> Section {
     };
     let axes = Axes::new("Strength factors (vars)", "quadrupole", "factor on the design gradient [1]");
     let figure = Figure::bands(&axes.named(&names).compared(Reference::Level(1.0)), &[factors]);
-    section("Strengths", "What the optics follow from: means, 68 % and 95 % intervals.".into(), figure)
+    section("Strengths", "Means, 68 % and 95 % intervals. Optics follow from them with the design's other magnets, and are known better than intervals say that leave \
+         room for a design that is off.".into(), figure)
 }

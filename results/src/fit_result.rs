@@ -10,12 +10,14 @@ use std::borrow::Cow;
 use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
 use inference::nuts::{NutsRun, UNMIXED};
-use inference::{BatchFit, Campaign, Draws, FittedOptics, Imitation, Lack, Prior, Recording, Reduced, Summary};
+use inference::{
+    BatchFit, Campaign, Draws, Imitation, Lack, OpticsFunctions, Prior, Recording, Reduced, Summary, THROUGHOUT,
+};
 use nalgebra::DMatrix;
 use schemars::JsonSchema;
 use serde::Serialize;
 use studies::Sampled;
-use twin::Ring;
+use twin::{OrbitError, Ring};
 
 pub use monitor::{Monitor, faults, monitors, state_word};
 pub use tunes::{TuneMeasured, Tunes, TunesMeasured};
@@ -72,7 +74,7 @@ pub struct FitResult {
     pub extrapolated: Option<f64>,
     /// The optics at every element, of a batch fit.
     #[serde(skip)]
-    pub calibrated: Option<FittedOptics>,
+    pub calibrated: Option<OpticsFunctions>,
     /// How it was found, for a person.
     #[serde(skip)]
     pub notes: Vec<String>,
@@ -137,6 +139,9 @@ fn latest(recording: &Recording) -> Cow<'_, Recording> {
 impl FitResult {
     /// What a core says after its last frame, here or on a device, whose params walked by so much; the core takes the design for exact, and here its
     /// error bars get room for what vars may imitate ([`Imitation`]).
+    ///
+    /// # Errors
+    /// [`OrbitError`] if the design, or one beside it, has no stable orbit.
     pub fn of_core(
         model: &'static str,
         ring: &Ring,
@@ -144,9 +149,9 @@ impl FitResult {
         last: &EstimateRecord,
         quality: FitQuality,
         timing: Timing,
-    ) -> Self {
+    ) -> Result<Self, OrbitError> {
         let prior = Prior::from_ring(ring);
-        let of_params = widened(ring, recording, last);
+        let of_params = widened(ring, recording, last)?;
         let marginal = |i: usize| prior.marginal(i, last.centre[i].into(), of_params[(i, i)].sqrt());
         let marginals = (0..prior.len()).map(marginal);
         let each = ring.var_names().into_iter().zip(marginals).zip(&last.clipped);
@@ -154,7 +159,7 @@ impl FitResult {
         // vars that walk are those of the last frames, and so are their tunes
         let seen = if walk.params > 0.0 { latest(recording) } else { Cow::Borrowed(recording) };
         let tunes = tunes(&recording.powered(ring), last, &seen.mean_supplies());
-        Self {
+        Ok(Self {
             recording: recording.name.clone(),
             method: "laplace",
             model,
@@ -178,7 +183,7 @@ impl FitResult {
             nuts: None,
             extrapolated: None,
             notes: Vec::new(),
-        }
+        })
     }
 
     /// What the batch fit says; where the design may be wrong, with room for what vars imitate of that.
@@ -219,7 +224,7 @@ impl FitResult {
         let ([x, y], ring) = (&fit.tunes, &campaign.ring);
         let calibrated = fit.optics(campaign).ok();
         let sigma = calibrated.as_ref().map(|(_, (_, tunes))| *tunes);
-        let of_places = |(optics, (sigma, _)): &FittedOptics| optics_at(ring, &places(ring), &optics.twiss, sigma);
+        let of_places = |(optics, (sigma, _)): &OpticsFunctions| optics_at(ring, &places(ring), &optics.twiss, sigma);
         Self {
             recording: campaign.recording.name.clone(),
             method: "",
@@ -273,7 +278,7 @@ impl FitResult {
     fn remarks(&self) -> Vec<String> {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
         let remarks = [
-            ImperfectionResult::large(&self.imperfections).map(|large| format!("off throughout the ring: {large}")),
+            ImperfectionResult::large(&self.imperfections).map(|large| format!("{THROUGHOUT}: {large}")),
             self.lack.as_ref().map(|lack| format!("{lack}: the result is the prior, but for measured tunes")),
             self.tunes.and_then(|tunes| self.tunes_measured.remark(&tunes)),
             (!clipped.is_empty()).then(|| format!("* at a bound of the prior's range: {}", clipped.join(", "))),
@@ -312,14 +317,13 @@ impl fmt::Display for FitResult {
 }
 
 /// Covariance of each theta, with room for magnets that are off throughout the ring.
-fn widened(ring: &Ring, recording: &Recording, last: &EstimateRecord) -> DMatrix<f64> {
+fn widened(ring: &Ring, recording: &Recording, last: &EstimateRecord) -> Result<DMatrix<f64>, OrbitError> {
     let of_params = |i: usize, j: usize| match i == j {
         true => f64::from(last.params_sigma[i]).powi(2),
         false => f64::from(last.covariance_of(i, j)) / f64::from(last.mean[i] * last.mean[j]),
     };
     let covariance = DMatrix::from_fn(last.centre.len(), last.centre.len(), of_params);
-    // a core of a design without a stable orbit cannot be made
-    Imitation::from_recording(ring, recording).map_or_else(|_| covariance.clone(), |one| one.widened(&covariance))
+    Ok(Imitation::new(ring, recording)?.widened(&covariance))
 }
 
 /// What a recording lacks to say anything, by what was read and what was moved.

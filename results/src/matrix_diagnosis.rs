@@ -2,6 +2,7 @@
 
 use core::fmt;
 
+use inference::THROUGHOUT;
 use measured::believed::Departure;
 use measured::diagnose::{Alternative, Diagnosis, Finding, Imperfection, What};
 use measured::held_out::HeldOut;
@@ -188,7 +189,7 @@ fn sentence(fitted: &Fit, findings: &[MatrixFinding], diagnosis: &Diagnosis) -> 
     let constant = |one: &Imperfection| format!("kick constant, {} {:+.1} %", one.class, 1e2 * one.mean);
     let constants: Vec<String> =
         diagnosis.imperfections.iter().filter(|one| one.is_kick_constant()).map(constant).collect();
-    let off = (!constants.is_empty()).then(|| format!("off throughout the ring: {}", constants.join(", ")));
+    let off = (!constants.is_empty()).then(|| format!("{THROUGHOUT}: {}", constants.join(", ")));
     let parts: Vec<String> = (doubt.into_iter())
         .chain(off)
         .chain(nothing.then(|| "nothing stands out of what its kind does everywhere".to_owned()))

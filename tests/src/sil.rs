@@ -110,7 +110,7 @@ fn side_by_side(
         interrupting,
         status,
         counts: Counts::new(),
-        result: FitResult::of_core(CoreModel::Green.word(), ring, (recording, walk), &last, quality, timing),
+        result: FitResult::of_core(CoreModel::Green.word(), ring, (recording, walk), &last, quality, timing)?,
     })
 }
 

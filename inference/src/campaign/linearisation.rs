@@ -147,7 +147,7 @@ impl Linearised {
         let (rf_params, rf_supplies) =
             (summed(&rf_slope, params.len(), &by_param), summed(&rf_slope, supply_count, &by_supply));
         let offsets = offsets(drives);
-        let here = Seen::of(&(machine, base), &design, amplitudes, &offsets)?;
+        let here = Observed::new((machine, base), (ring, &optics), amplitudes, &offsets)?;
         let rf = |(&offset, orbit): (&f64, &DVector<f64>)| RfOrbit {
             offset,
             orbit: orbit.clone(),
@@ -167,22 +167,25 @@ impl Linearised {
         for (at, term) in base.terms().iter().enumerate() {
             let mut amplitudes = amplitudes.to_vec();
             amplitudes[at] += term.step();
-            let there = Seen::of(&(machine, base), &design, &amplitudes, &offsets)?;
+            let ring = base.ring(&design, &amplitudes);
+            let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 })?;
+            let there = Observed::new((machine, base), (&ring, &optics), &amplitudes, &offsets)?;
             linearised.set_slope(vars + at, &there.slope_from(&here, term.step()));
         }
         Ok(linearised)
     }
 
-    /// Derivatives of the response [B][C + 1], that to the RF offset in its last column [m], and of both tunes, with respect to one param.
-    pub fn slope(&self, param: usize) -> (DMatrix<f64>, Vector2<f64>) {
-        let (monitors, correctors) = self.response.shape();
-        let of_rf = |b: usize| self.rf.first().map_or(0.0, |rf| rf.slopes[(param, b)] / rf.offset);
-        let element = |b: usize, c: usize| if c < correctors { self.slopes[b][(param, c)] } else { of_rf(b) };
-        (DMatrix::from_fn(monitors, correctors + 1, element), self.tune_slopes.fixed_rows::<2>(0).column(param).into())
+    /// Derivatives of the response of one monitor [N + K][C + 1], that to the RF offset in the last column [m]; 0 there without offsets.
+    pub fn slopes_at(&self, b: usize) -> DMatrix<f64> {
+        let mut slopes = self.slopes[b].clone().insert_column(self.response.ncols(), 0.0);
+        if let Some(rf) = self.rf.first() {
+            slopes.column_mut(self.response.ncols()).copy_from(&(rf.slopes.column(b) / rf.offset));
+        }
+        slopes
     }
 
     /// The derivatives with respect to one param.
-    fn set_slope(&mut self, param: usize, slope: &Seen) {
+    fn set_slope(&mut self, param: usize, slope: &Observed) {
         self.slopes.iter_mut().zip(slope.response.row_iter()).for_each(|(to, row)| to.set_row(param, &row));
         self.rf.iter_mut().zip(&slope.rf).for_each(|(to, orbit)| to.slopes.set_row(param, &orbit.transpose()));
         self.tune_slopes.set_column(param, &Vector2::new(slope.tunes.x, slope.tunes.y));
@@ -230,7 +233,7 @@ impl Linearised {
 }
 
 /// What frames see of a ring, or its derivative with respect to a term of the base model.
-struct Seen {
+struct Observed {
     /// Response of the read monitors to the correctors [B][C] [m/rad].
     response: DMatrix<f64>,
     /// Orbit of each RF offset [B] [m].
@@ -238,17 +241,15 @@ struct Seen {
     tunes: Tunes,
 }
 
-impl Seen {
-    /// Of a design with amplitudes of the base model's terms.
-    fn of(
-        (machine, base): &(&Machine, BaseModel),
-        design: &Ring,
+impl Observed {
+    /// Of a ring that has these amplitudes of the base model's terms.
+    fn new(
+        (machine, base): (&Machine, BaseModel),
+        (ring, optics): (&Ring, &Optics),
         amplitudes: &[f64],
         offsets: &[f64],
     ) -> Result<Self, OrbitError> {
-        let ring = &base.ring(design, amplitudes);
-        let optics = Optics::of(ring, Hold::Momentum { delta: 0.0 })?;
-        let response = machine.held_of(ring, &optics)?.response(&optics, &optics.read_monitors(), &optics.correctors());
+        let response = machine.held_of(ring, optics)?.response(optics, &optics.read_monitors(), &optics.correctors());
         let rf = |offset: &f64| Ok(rf_orbit(ring, *offset)? * base.rf_factor(amplitudes));
         Ok(Self {
             response: scaled(response, &base.kick_factors(ring, amplitudes)),

@@ -18,6 +18,11 @@ use crate::cli::{Fit, FitModel, Method};
 /// [`CommandError`].
 pub fn run(options: &Fit) -> Result<(), CommandError> {
     if Folder::is_one(&options.recording) {
+        if options.exact_design {
+            return Err(CommandError::Input(
+                "--exact-design is for a recording; a measured matrix has no such room".into(),
+            ));
+        }
         return matrix::fit(options);
     }
     check(options)?;

@@ -42,7 +42,7 @@ pub fn run(options: &Replay) -> Result<(), CommandError> {
     let bar = progress(recording.rows.len(), "frames", options.common.quiet);
     let last = stream_all(&mut source, sinks, &stop, &bar)?;
     let (quality, timing) = (source.quality(), source.times.quantiles());
-    let result = FitResult::of_core(options.model.word(), &ring, (&recording, walk), &last, quality, timing);
+    let result = FitResult::of_core(options.model.word(), &ring, (&recording, walk), &last, quality, timing)?;
     let extrapolated = (options.model == CoreModel::Resnet).then(|| source.extrapolated());
     deliver(&options.common, &FitResult { extrapolated, ..result })
 }

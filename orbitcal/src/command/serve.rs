@@ -96,7 +96,7 @@ fn feed(
     let (quality, timing) = (source.quality().map_err(CommandError::other)?, source.times.quantiles());
     deliver(
         &options.common,
-        &FitResult::of_core(options.model.word(), ring, (recording, setup.walk), &last, quality, timing),
+        &FitResult::of_core(options.model.word(), ring, (recording, setup.walk), &last, quality, timing)?,
     )
 }
 
