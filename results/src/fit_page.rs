@@ -189,6 +189,7 @@ fn strengths(result: &FitResult) -> Section {
     };
     let axes = Axes::new("Strength factors (vars)", "quadrupole", "factor on the design gradient [1]");
     let figure = Figure::bands(&axes.named(&names).compared(Reference::Level(1.0)), &[factors]);
-    section("Strengths", "Means, 68 % and 95 % intervals. Optics follow from them with the design's other magnets, and are known better than intervals say that leave \
-         room for a design that is off.".into(), figure)
+    let text = "Means, 68 % and 95 % intervals. Optics follow from the means with the design's other magnets. They are known better than the \
+                intervals say, which leave room for a design that is off.";
+    section("Strengths", text.into(), figure)
 }
