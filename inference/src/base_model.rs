@@ -248,7 +248,7 @@ mod tests {
         let supplies = vec![0.0; ring.supplies.len()];
         let at = |amplitudes: [f64; 6]| {
             let params = DVector::from_iterator(54, (0..48).map(|_| 0.0).chain(amplitudes));
-            let drives = std::slice::from_ref(&drive);
+            let drives = core::slice::from_ref(&drive);
             let linearised = Linearised::about((&machine, ALL), &params, &supplies, drives).unwrap();
             (linearised.orbits(drives), linearised.slopes(drives))
         };

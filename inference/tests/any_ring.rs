@@ -45,7 +45,7 @@ fn without(ring: &Ring, columns: &[&str], corrector: Option<&str>) -> Recording 
 
 fn fit(ring: &Ring, recording: &Recording, tunes: TuneUse) -> (Campaign, BatchFit) {
     let campaign = Campaign::of(ring, recording).unwrap();
-    let fit = BatchFit::best(&campaign, tunes, |_| ()).unwrap();
+    let fit = BatchFit::best(&campaign, tunes, BaseModel::EXACT, |_| ()).unwrap();
     (campaign, fit)
 }
 

@@ -209,8 +209,16 @@ fn without_tunes_and_rf(recording: &Recording) -> Recording {
     left
 }
 
+/// A campaign with the ring that is its model.
+struct Modelled {
+    what: String,
+    ring: Ring,
+    recording: Recording,
+    truth: Vec<f64>,
+}
+
 /// Campaigns of two rings, each also with the other's ring as the model: the decks' dipoles, lengths, energies and strengths differ.
-fn crossed() -> Option<Vec<(String, Ring, Recording, Vec<f64>)>> {
+fn crossed() -> Option<Vec<Modelled>> {
     let rings = [deck()?, Ring::read(&shared("booster/booster.json")?).unwrap()];
     let files = [("booster-deck.json", "1.5586044"), ("booster.json", "1.5")];
     let mut all = Vec::new();
@@ -221,8 +229,10 @@ fn crossed() -> Option<Vec<(String, Ring, Recording, Vec<f64>)>> {
             let truth = ring.var_names().iter().map(|var| truth["vars"][var].as_f64().unwrap()).collect::<Vec<f64>>();
             let recording = of_machine(name, lattice, energy, ring)?;
             let bare = without_tunes_and_rf(&recording);
-            all.push((format!("{name} with {lattice}"), ring.clone(), recording, truth.clone()));
-            all.push((format!("{name} with {lattice}, orbits alone"), ring.clone(), bare, truth));
+            for (recording, left) in [(recording, ""), (bare, ", orbits alone")] {
+                let (what, truth) = (format!("{name} with {lattice}{left}"), truth.clone());
+                all.push(Modelled { what, ring: ring.clone(), recording, truth });
+            }
         }
     }
     Some(all)
@@ -233,7 +243,7 @@ fn crossed() -> Option<Vec<(String, Ring, Recording, Vec<f64>)>> {
 fn vars_are_honest_with_the_ring_of_another_deck() {
     let Some(all) = crossed() else { return };
     let mut worst = 0.0_f64;
-    for (what, ring, recording, truth) in all {
+    for Modelled { what, ring, recording, truth } in all {
         let campaign = Campaign::of(&ring, &recording).unwrap();
         let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::SCALES, |_| ()).unwrap();
         worst = worst.max(nees(&fit, &truth));
