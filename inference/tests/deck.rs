@@ -255,7 +255,7 @@ fn vars_are_honest_with_the_ring_of_another_deck() {
         }
     }
     // a design that is taken for exact makes vars too sure
-    assert!(worst > 3.0, "{worst}");
+    assert!(worst > 2.0, "{worst}");
 }
 
 #[test]
