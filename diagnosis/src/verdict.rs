@@ -450,17 +450,17 @@ pub fn sentence(
     };
     let contradicted = contradictions.iter().map(|one| in_recording(data, &one.recording, one.to_string()));
     let mut said: Vec<String> = contradicted.chain(beyond.iter().map(OutOfRange::to_string)).collect();
-    let (common, scatters): (Vec<Imperfection>, Vec<Imperfection>) = (widths::rows(data, &found.best).into_iter())
-        .filter(Imperfection::is_large)
-        .partition(|row| row.measure == Measure::Mean);
+    let rows = widths::rows(data, &found.best).into_iter();
+    let (common, scatters): (Vec<Imperfection>, Vec<Imperfection>) = rows.partition(|row| row.measure == Measure::Mean);
+    let off = Imperfection::large(&common).map(|large| format!("{THROUGHOUT}: {large}"));
     // these are no missing physics, and a consistent recording's sentence begins with them
-    if verdict == Verdict::Consistent && !(said.is_empty() && common.is_empty()) {
+    if verdict == Verdict::Consistent && !(said.is_empty() && off.is_none()) {
         said.push(format!("besides, {text}"));
     } else {
         said.insert(0, text);
     }
-    said.splice(0..0, Imperfection::list(THROUGHOUT, &common));
-    said.extend(Imperfection::list("larger than ordinary", &scatters));
+    said.splice(0..0, off);
+    said.extend(Imperfection::large(&scatters).map(|large| format!("larger than ordinary: {large}")));
     said.extend(remarks(data));
     capitalised(&said.join("; "))
 }

@@ -36,7 +36,7 @@ pub struct FittedTerm {
 
 impl FittedTerm {
     /// As a row of the table of imperfections.
-    pub fn imperfection(&self) -> Imperfection {
+    pub(crate) fn imperfection(&self) -> Imperfection {
         let Self { term, measured } = *self;
         Imperfection {
             name: term.name(),
@@ -116,6 +116,11 @@ impl BaseTerm {
     fn range(self) -> [f64; 2] {
         let least = if let Self::Kick(_) = self { LEAST - 1.0 } else { f64::NEG_INFINITY };
         [least, f64::INFINITY]
+    }
+
+    /// True for what changes the ring itself, not how kicks and RF offsets are scaled.
+    pub(crate) const fn is_of_magnets(self) -> bool {
+        matches!(self, Self::DipoleGradient | Self::DipoleEdge | Self::Momentum)
     }
 
     /// Amplitude that a derivative is taken over.

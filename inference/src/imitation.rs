@@ -26,7 +26,7 @@ use crate::base_model::BaseModel;
 use crate::campaign::{Linearised, Meter};
 use crate::draws::Draws;
 use crate::prior::Prior;
-use crate::recording::{Drive, Recording, Row};
+use crate::recording::{Drive, Recording};
 
 /// How vars imitate a base model in one recording.
 #[derive(Debug, Clone)]
@@ -120,13 +120,8 @@ fn weights(recording: &Recording) -> Vec<f64> {
 
 /// What a meter tells of the tune in x and in y, 0 without one.
 fn tune_information(recording: &Recording) -> [f64; 2] {
-    let times = recording.times();
-    let of_plane = |plane: usize| {
-        let at_rest = |row: &Row| row.tune[plane].filter(|_| row.rf_offset == 0.0).unwrap_or(f64::NAN);
-        let tunes: Vec<f64> = recording.rows.iter().map(at_rest).collect();
-        Meter::from_tunes(tunes.iter().zip(&times)).map_or(0.0, |meter| meter.whiten.column(0).norm_squared())
-    };
-    [of_plane(0), of_plane(1)]
+    [0, 1]
+        .map(|plane| Meter::from_recording(recording, plane).map_or(0.0, |meter| meter.whiten.column(0).norm_squared()))
 }
 
 #[cfg(test)]

@@ -58,14 +58,14 @@ impl Imperfection {
     }
 
     /// In a sentence: what it is and its size.
-    pub fn said(&self) -> String {
+    fn said(&self) -> String {
         format!("{} {}", self.what(), self.size())
     }
 
-    /// Several in a sentence; none without any.
-    pub fn list(what: &str, all: &[Self]) -> Option<String> {
-        let said: Vec<String> = all.iter().map(Self::said).collect();
-        (!said.is_empty()).then(|| format!("{what}: {}", said.join(", ")))
+    /// Those that are larger than ordinary, with their sizes; none without any.
+    pub fn large(all: &[Self]) -> Option<String> {
+        let said: Vec<String> = all.iter().filter(|one| one.is_large()).map(Self::said).collect();
+        (!said.is_empty()).then(|| said.join(", "))
     }
 
     fn what(&self) -> String {

@@ -17,6 +17,7 @@ use twin::{CalibratedOptics, Measured, OrbitError, Tunes, Twiss};
 
 use crate::base_model::{BaseModel, BaseTerm, FittedTerm};
 use crate::campaign::{AtTimes, Campaign, Normal, Terms, Weighed, chi_square};
+use crate::imperfection::Imperfection;
 use crate::optimise::{End, Limits, Objective, OptimiseError, Optimum, Quadratic, minimise};
 use crate::prior::Prior;
 
@@ -162,6 +163,11 @@ impl BatchFit {
     pub(crate) fn values(&self) -> Vec<f64> {
         let amplitudes = self.base.iter().map(|fitted| fitted.measured.value);
         self.map_params.iter().copied().chain(amplitudes).collect()
+    }
+
+    /// What the design is off by, as rows of the table of imperfections.
+    pub fn imperfections(&self) -> Vec<Imperfection> {
+        self.base.iter().map(FittedTerm::imperfection).collect()
     }
 
     /// The optics of the ring as fitted, at the campaign's mean supplies, `sigma^2 = J C J^T`.

@@ -109,13 +109,14 @@ impl Reduced {
         for (mut row, drive) in readings.row_iter_mut().zip(drives) {
             row += (&response * drive.kick.push(drive.rf_offset).component_mul(&factors)).transpose();
         }
+        let slopes: Vec<DMatrix<f64>> = (0..readings.ncols()).map(|b| linearised.at_mean.slopes_at(b)).collect();
         let slope = |(at, fitted): (usize, &FittedTerm)| {
-            let mut response = DMatrix::zeros(readings.ncols(), factors.len());
-            for (b, mut row) in response.row_iter_mut().enumerate() {
-                row.copy_from(&linearised.at_mean.slopes_at(b).row(vars + at));
+            let response = |b: usize, c: usize| slopes[b][(vars + at, c)] / factors[c];
+            BaseSlope {
+                response: DMatrix::from_fn(slopes.len(), factors.len(), response),
+                value: fitted.measured.value,
+                precision: fitted.term.width().powi(-2),
             }
-            response.column_iter_mut().zip(factors.iter()).for_each(|(mut column, factor)| column /= *factor);
-            BaseSlope { response, value: fitted.measured.value, precision: fitted.term.width().powi(-2) }
         };
         let base = fit.base.iter().enumerate().map(slope).collect();
         Ok(Self { campaign, fit, readings, factors, base })

@@ -6,7 +6,7 @@ use estimator::Walk;
 use comfy_table::CellAlignment;
 use diagnosis::{DataError, Miswired};
 use inference::stream::{self, Core};
-use inference::{BaseModel, BatchFit, Campaign, Lack, Recording, TuneUse};
+use inference::{BaseModel, BatchFit, Campaign, Imperfection, Lack, Recording, TuneUse};
 use schemars::JsonSchema;
 use serde::Serialize;
 use training::rooms::largest;
@@ -41,6 +41,9 @@ pub struct CheckResult {
     monitors: Vec<Monitor>,
     /// By what kicks and RF steps are off throughout the ring, of a batch fit; none without one.
     imperfections: Vec<ImperfectionResult>,
+    /// Those that are larger than ordinary, for a person.
+    #[serde(skip)]
+    off: Option<String>,
     /// Monitors without any reading.
     silent_monitors: Vec<String>,
     /// Share of readings that are missing.
@@ -112,7 +115,7 @@ impl CheckResult {
 
     fn of_campaign(ring: &Ring, campaign: &Campaign) -> Self {
         let Recording { name, rows, .. } = &campaign.recording;
-        let tunes = design_tunes(campaign);
+        let (tunes, off) = (design_tunes(campaign), off_throughout(campaign));
         let readings = &campaign.readings;
         let silent = |b: &usize| readings.column(*b).iter().all(|reading| reading.is_nan());
         let names = ring.monitor_names();
@@ -129,7 +132,8 @@ impl CheckResult {
             tunes_measured: TunesMeasured::of_recording(&campaign.recording, tunes.map(|t| [t.x, t.y])),
             tunes: tunes.map(|t| DesignTunes { x: t.x, y: t.y }),
             monitors: monitors(ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
-            imperfections: off_throughout(campaign),
+            imperfections: off.iter().map(ImperfectionResult::from).collect(),
+            off: Imperfection::large(&off),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),
             missing: readings.iter().filter(|reading| reading.is_nan()).count() as f64 / readings.len().max(1) as f64,
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],
@@ -138,10 +142,9 @@ impl CheckResult {
 }
 
 /// What the design is off by; none where no batch fit ends.
-fn off_throughout(campaign: &Campaign) -> Vec<ImperfectionResult> {
+fn off_throughout(campaign: &Campaign) -> Vec<Imperfection> {
     let fit = BatchFit::best(campaign, TuneUse::Readings, BaseModel::SCALES, |_| ());
-    let terms = fit.map(|fit| fit.base).unwrap_or_default();
-    terms.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect()
+    fit.map(|fit| fit.imperfections()).unwrap_or_default()
 }
 
 /// Times in the cycle along a ramp [ms]; none where the machine file has none.
@@ -331,9 +334,9 @@ impl CheckResult {
             ("monitors", faults(&self.monitors)),
             ("readings missing", format!("{:.1} %", 100.0 * self.missing)),
         ];
-        let off = ImperfectionResult::large(&self.imperfections).map(|large| ("off throughout", large));
         let lists = [("without a kick", &settings.unused), ("without a reading", &self.silent_monitors)];
         let lists = lists.into_iter().filter(|(_, names)| !names.is_empty());
+        let off = self.off.iter().map(|off| ("off throughout", off.clone()));
         facts.into_iter().chain(off).chain(lists.map(|(name, names)| (name, names.join(", ")))).collect()
     }
 }

@@ -11,7 +11,8 @@ use comfy_table::{CellAlignment, Table};
 use estimator::{FitQuality, Marginal, Walk};
 use inference::nuts::{NutsRun, UNMIXED};
 use inference::{
-    BatchFit, Campaign, Draws, Imitation, Lack, OpticsFunctions, Prior, Recording, Reduced, Summary, THROUGHOUT,
+    BatchFit, Campaign, Draws, Imitation, Imperfection, Lack, OpticsFunctions, Prior, Recording, Reduced, Summary,
+    THROUGHOUT,
 };
 use nalgebra::DMatrix;
 use schemars::JsonSchema;
@@ -72,6 +73,9 @@ pub struct FitResult {
     /// Share of the frames that were predicted outside the range that the model was made for; only of a model that has one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub extrapolated: Option<f64>,
+    /// What of the design is off by more than ordinary, for a person.
+    #[serde(skip)]
+    pub off: Option<String>,
     /// The optics at every element, of a batch fit.
     #[serde(skip)]
     pub calibrated: Option<OpticsFunctions>,
@@ -176,6 +180,7 @@ impl FitResult {
             mismatch: quality.is_mismatch(),
             monitors: last.monitors(),
             calibrated: None,
+            off: None,
             imperfections: Vec::new(),
             optics: Vec::new(),
             log_evidence: Some(f64::from(last.log_evidence)),
@@ -242,7 +247,8 @@ impl FitResult {
             calibrated,
             lack: fit.lack.map(|lack| lack.to_string()),
             monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
-            imperfections: fit.base.iter().map(|term| ImperfectionResult::from(&term.imperfection())).collect(),
+            off: Imperfection::large(&fit.imperfections()),
+            imperfections: fit.imperfections().iter().map(ImperfectionResult::from).collect(),
             log_evidence: None,
             timing: None,
             nuts: None,
@@ -278,7 +284,7 @@ impl FitResult {
     fn remarks(&self) -> Vec<String> {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
         let remarks = [
-            ImperfectionResult::large(&self.imperfections).map(|large| format!("{THROUGHOUT}: {large}")),
+            self.off.as_ref().map(|off| format!("{THROUGHOUT}: {off}")),
             self.lack.as_ref().map(|lack| format!("{lack}: the result is the prior, but for measured tunes")),
             self.tunes.and_then(|tunes| self.tunes_measured.remark(&tunes)),
             (!clipped.is_empty()).then(|| format!("* at a bound of the prior's range: {}", clipped.join(", "))),

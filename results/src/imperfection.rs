@@ -20,9 +20,6 @@ pub struct ImperfectionResult {
     /// For a person, of one that is seen.
     #[serde(skip)]
     pub(crate) row: Option<[String; 4]>,
-    /// In a sentence, of one that is larger than ordinary.
-    #[serde(skip)]
-    pub(crate) said: Option<String>,
 }
 
 impl From<&Imperfection> for ImperfectionResult {
@@ -32,15 +29,7 @@ impl From<&Imperfection> for ImperfectionResult {
             Measure::Mean => [measured.value, 0.0],
             Measure::Scatter => [0.0, measured.value],
         };
-        let (row, said) = (one.is_seen().then(|| one.row()), one.is_large().then(|| one.said()));
-        Self { kind, at: one.at.clone(), mean, scatter, sigma: measured.sigma, unit: unit.symbol, row, said }
-    }
-}
-
-impl ImperfectionResult {
-    /// Those that are larger than ordinary, in a sentence; none without any.
-    pub(crate) fn large(all: &[Self]) -> Option<String> {
-        let said: Vec<&str> = all.iter().filter_map(|one| one.said.as_deref()).collect();
-        (!said.is_empty()).then(|| said.join(", "))
+        let row = one.is_seen().then(|| one.row());
+        Self { kind, at: one.at.clone(), mean, scatter, sigma: measured.sigma, unit: unit.symbol, row }
     }
 }

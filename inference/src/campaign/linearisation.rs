@@ -3,7 +3,7 @@
 //! The params are the vars, and after them the amplitudes of the base model's terms ([`BaseModel`]), if it has any.
 
 use nalgebra::{DMatrix, DVector, Vector2};
-use twin::{ClosedOrbit, Hold, Machine, Optics, OrbitError, Plane, Ring, Tunes};
+use twin::{ClosedOrbit, Held, Hold, Machine, Optics, OrbitError, Plane, Ring, Tunes};
 
 use super::times::Times;
 use crate::base_model::BaseModel;
@@ -147,7 +147,8 @@ impl Linearised {
         let (rf_params, rf_supplies) =
             (summed(&rf_slope, params.len(), &by_param), summed(&rf_slope, supply_count, &by_supply));
         let offsets = offsets(drives);
-        let here = Observed::new((machine, base), (ring, &optics), amplitudes, &offsets)?;
+        let bare = Observed::new(&held, (ring, &optics), &offsets)?;
+        let here = bare.scaled(base, ring, amplitudes);
         let rf = |(&offset, orbit): (&f64, &DVector<f64>)| RfOrbit {
             offset,
             orbit: orbit.clone(),
@@ -167,9 +168,14 @@ impl Linearised {
         for (at, term) in base.terms().iter().enumerate() {
             let mut amplitudes = amplitudes.to_vec();
             amplitudes[at] += term.step();
-            let ring = base.ring(&design, &amplitudes);
-            let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 })?;
-            let there = Observed::new((machine, base), (&ring, &optics), &amplitudes, &offsets)?;
+            let there = if term.is_of_magnets() {
+                let ring = base.ring(&design, &amplitudes);
+                let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 })?;
+                Observed::new(&machine.held_of(&ring, &optics)?, (&ring, &optics), &offsets)?
+            } else {
+                bare.clone()
+            };
+            let there = there.scaled(base, ring, &amplitudes);
             linearised.set_slope(vars + at, &there.slope_from(&here, term.step()));
         }
         Ok(linearised)
@@ -233,6 +239,7 @@ impl Linearised {
 }
 
 /// What frames see of a ring, or its derivative with respect to a term of the base model.
+#[derive(Debug, Clone)]
 struct Observed {
     /// Response of the read monitors to the correctors [B][C] [m/rad].
     response: DMatrix<f64>,
@@ -242,20 +249,23 @@ struct Observed {
 }
 
 impl Observed {
-    /// Of a ring that has these amplitudes of the base model's terms.
-    fn new(
-        (machine, base): (&Machine, BaseModel),
-        (ring, optics): (&Ring, &Optics),
-        amplitudes: &[f64],
-        offsets: &[f64],
-    ) -> Result<Self, OrbitError> {
-        let response = machine.held_of(ring, optics)?.response(optics, &optics.read_monitors(), &optics.correctors());
-        let rf = |offset: &f64| Ok(rf_orbit(ring, *offset)? * base.rf_factor(amplitudes));
+    /// Of a ring whose kicks and RF offsets are as recorded.
+    fn new(held: &Held, (ring, optics): (&Ring, &Optics), offsets: &[f64]) -> Result<Self, OrbitError> {
         Ok(Self {
-            response: scaled(response, &base.kick_factors(ring, amplitudes)),
-            rf: offsets.iter().map(rf).collect::<Result<_, OrbitError>>()?,
+            response: held.response(optics, &optics.read_monitors(), &optics.correctors()),
+            rf: offsets.iter().map(|offset| rf_orbit(ring, *offset)).collect::<Result<_, OrbitError>>()?,
             tunes: optics.tunes()?,
         })
+    }
+
+    /// The same with the factors of a base model's terms.
+    fn scaled(&self, base: BaseModel, ring: &Ring, amplitudes: &[f64]) -> Self {
+        let factor = base.rf_factor(amplitudes);
+        Self {
+            response: scaled(self.response.clone(), &base.kick_factors(ring, amplitudes)),
+            rf: self.rf.iter().map(|orbit| orbit * factor).collect(),
+            tunes: self.tunes,
+        }
     }
 
     /// The derivative, from what is seen a step away.

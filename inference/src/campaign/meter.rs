@@ -2,6 +2,8 @@
 
 use nalgebra::{Matrix2, Vector2};
 
+use crate::recording::{Recording, Row};
+
 /// One measured tune: what it was in mid-campaign, and how much it changed to the end.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Meter {
@@ -23,6 +25,13 @@ const FEWEST: usize = 8;
 const ROUNDING: f64 = 3e-6;
 
 impl Meter {
+    /// Of the tune in x or y of a recording's frames without an RF offset, which moves it.
+    pub fn from_recording(recording: &Recording, plane: usize) -> Option<Self> {
+        let at_rest = |row: &Row| row.tune[plane].filter(|_| row.rf_offset == 0.0).unwrap_or(f64::NAN);
+        let tunes: Vec<f64> = recording.rows.iter().map(at_rest).collect();
+        Self::from_tunes(tunes.iter().zip(&recording.times()))
+    }
+
     /// A line through the tunes over time, which goes from -1 to 1; missing ones are not numbers. None of too few.
     pub fn from_tunes<'a>(frames: impl Iterator<Item = (&'a f64, &'a f64)>) -> Option<Self> {
         let points: Vec<(f64, f64)> =

@@ -3,7 +3,6 @@
 use core::fmt;
 
 use inference::TUNE_CALIBRATION;
-use inference::recording::Row;
 use inference::{FittedTune, Meter, Recording};
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -78,12 +77,8 @@ pub struct TuneMeasured {
 impl TunesMeasured {
     /// What the meter says of a recording, with the integer parts of the model's.
     pub fn of_recording(recording: &Recording, model: Option<[f64; 2]>) -> Self {
-        let time = recording.times();
         let one = |plane: usize| {
-            // an RF offset moves the tune
-            let tune = |row: &Row| row.tune[plane].filter(|_| row.rf_offset == 0.0).unwrap_or(f64::NAN);
-            let tunes: Vec<f64> = recording.rows.iter().map(tune).collect();
-            let meter = Meter::from_tunes(tunes.iter().zip(&time))?;
+            let meter = Meter::from_recording(recording, plane)?;
             Some(TuneMeasured { mean: meter.near(model.map_or(0.0, |tunes| tunes[plane])), sigma: meter.sigma })
         };
         Self { x: one(0), y: one(1) }
