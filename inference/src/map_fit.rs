@@ -142,7 +142,8 @@ impl BatchFit {
         mut progress: impl FnMut(usize),
     ) -> Result<Self, BatchError> {
         let problem = Problem { campaign, tunes, base, prior: base.prior(&campaign.prior) };
-        let start = campaign.params.clone().resize_vertically(problem.prior.len(), 0.0);
+        // not the screening's params: a kick constant that is off may have pulled them next to another tune
+        let start = campaign.prior.mean.clone().resize_vertically(problem.prior.len(), 0.0);
         let watch = |steps, _| {
             progress(steps);
             true
