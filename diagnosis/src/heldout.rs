@@ -298,7 +298,9 @@ pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
 /// # Errors
 /// [`FitError`].
 pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
-    lessened(data, fitted, fitted.hypothesis.without_terms(|_| true).without_element())
+    let terms = &fitted.hypothesis.terms;
+    let none = fitted.hypothesis.without_terms(|_| true).without_element();
+    lessened(data, fitted, terms.iter().fold(none, |less, term| less.without_family(*term, data)))
 }
 
 /// The same fit without one of its terms.

@@ -139,6 +139,17 @@ impl Hypothesis {
         less
     }
 
+    /// Without a family whose only member is this effect: it predicts as the effect does, at another size.
+    pub(crate) fn without_family(&self, term: Term, data: &Data) -> Self {
+        let is_it = |family: &Family| {
+            let members = family.members(data);
+            !members.is_empty() && members.iter().all(|member| member.terms == [term])
+        };
+        let mut less = self.clone();
+        less.ordinary.retain(|family| !is_it(family));
+        less
+    }
+
     /// Without the unknown element.
     pub fn without_element(&self) -> Self {
         Self { element: None, ..self.clone() }
