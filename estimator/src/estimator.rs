@@ -496,8 +496,8 @@ impl<
     #[inline(never)]
     pub fn learn(&mut self, model: &Model<'_, G, B, C, F>, judged: &mut Judged<B, C, F, W>) {
         if judged.remarks.put_aside {
-            // its drive tells where correctors stand, as long as no others do
-            if !self.past.recent.is_full() {
+            // its drive tells where correctors stand, as long as no frame counts that does
+            if self.past.recent.iter().all(|kept| kept.accepted.count() == 0) {
                 self.keep_loose(model, &judged.frame, &judged.drive, &judged.screened);
             }
             return;
@@ -798,6 +798,12 @@ impl<
         drive: &Drive<C, F>,
         screened: &Screened<W>,
     ) {
+        // what counts does not leave the earlier for those that do not
+        while screened.accepted.count() > 0
+            && let Some(oldest) = self.past.recent.pop_front_if(|oldest| oldest.accepted.count() == 0)
+        {
+            self.note_leaving(model, &oldest);
+        }
         if self.past.recent.is_full()
             && let Some(oldest) = self.past.recent.pop_front()
         {
