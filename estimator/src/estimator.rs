@@ -496,8 +496,8 @@ impl<
     #[inline(never)]
     pub fn learn(&mut self, model: &Model<'_, G, B, C, F>, judged: &mut Judged<B, C, F, W>) {
         if judged.remarks.put_aside {
-            // its drive tells where correctors stand, as long as no frame counts that does
-            if self.past.recent.iter().all(|kept| kept.accepted.count() == 0) {
+            // its drive tells where correctors stand, as long as there is room
+            if !self.past.recent.is_full() {
                 self.keep_loose(model, &judged.frame, &judged.drive, &judged.screened);
             }
             return;
@@ -798,13 +798,8 @@ impl<
         drive: &Drive<C, F>,
         screened: &Screened<W>,
     ) {
-        // what counts does not leave the earlier for those that do not
-        while screened.accepted.count() > 0
-            && let Some(oldest) = self.past.recent.pop_front_if(|oldest| oldest.accepted.count() == 0)
-        {
-            self.note_leaving(model, &oldest);
-        }
         if self.past.recent.is_full()
+            && !self.drop_silent()
             && let Some(oldest) = self.past.recent.pop_front()
         {
             self.note_leaving(model, &oldest);
@@ -817,6 +812,19 @@ impl<
         let kept = Loose { drive: *drive, reading: frame.reading, accepted: screened.accepted, first_channel };
         // there is room: one has just left
         let _ = self.past.recent.push_back(kept);
+    }
+
+    /// Drop the oldest recent frame of which no reading counts, so that none which counts leaves in its place; false if there is none.
+    fn drop_silent(&mut self) -> bool {
+        let recent = &mut self.past.recent;
+        let Some(silent) = recent.iter().position(|frame| frame.accepted.count() == 0) else { return false };
+        for at in 0..recent.len() {
+            let frame = recent.pop_front().filter(|_| at != silent);
+            // as many as there were, in their order
+            let _ = frame.map(|frame| recent.push_back(frame));
+        }
+        self.note_dropped(silent);
+        true
     }
 
     /// Linearise a frame for the last time.

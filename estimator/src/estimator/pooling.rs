@@ -233,6 +233,13 @@ impl<
         }
     }
 
+    /// A recent frame that says nothing is dropped: those after it move up.
+    pub(super) fn note_dropped(&mut self, at: usize) {
+        if let Work::Past(pooling) = &mut self.anew.work {
+            pooling.recent -= usize::from(at < pooling.recent);
+        }
+    }
+
     /// Let a late frame wait for the next slice. When as many as there is room for wait, all is counted anew instead.
     fn await_count(&mut self, late: Late<B, C, F, W>) {
         if self.anew.late.push_back(late).is_err() {
