@@ -653,6 +653,7 @@ impl<
         self.predicted.rf_offset = drive.rf_offset;
     }
 
+    #[inline(never)]
     fn predict_drive(&mut self, model: &Model<'_, G, B, C, F>, drive: &Drive<C, F>) {
         let drive = about(&self.believed(drive), &self.tangent.supplies);
         model.surrogate.predict(&self.tangent.linearised, &drive, &mut self.predicted.prediction);
@@ -700,6 +701,7 @@ impl<
     }
 
     /// Variance that repeats of a reading share: the stated error of the surrogate [m^2].
+    #[inline(never)]
     fn shared_variance(
         &self,
         model: &Model<'_, G, B, C, F>,

@@ -61,6 +61,7 @@ impl<
 > Estimator<G, B, C, F, N, S, K, T, U, W>
 {
     /// A drive by its read-backs, or their mean, without the share of their scatter that the beam does not follow.
+    #[inline(never)]
     pub(super) fn believed(&self, drive: &Drive<C, F>) -> Drive<C, F> {
         let (mut believed, ignored) = (*drive, self.past.read_back.ignored);
         if ignored > 0.0 {

@@ -73,6 +73,7 @@ impl<const C: usize> Reference<C> {
     }
 
     /// Kicks of idle correctors off the reference, the others 0 [rad].
+    #[inline(never)]
     pub fn scattered(&self, kick: &[f32; C]) -> [f32; C] {
         let mut off = *kick;
         for (off, reference) in off.iter_mut().zip(&self.kick) {
@@ -83,6 +84,7 @@ impl<const C: usize> Reference<C> {
     }
 
     /// A frame's kicks, seen from it, and nothing else of its drive.
+    #[inline(never)]
     fn moved<const F: usize>(&self, drive: &Drive<C, F>) -> Drive<C, F> {
         let mut kick = drive.kick;
         kick.iter_mut().zip(&self.kick).for_each(|(kick, reference)| *kick -= reference);
@@ -143,6 +145,7 @@ impl<
     }
 
     /// Mean square orbit of kicks over that which is noticed.
+    #[inline(never)]
     fn noticed(&mut self, model: &Model<'_, G, B, C, F>, moved: &Drive<C, F>) -> f32 {
         // work space: what the mean drive would have made is not known yet
         model.surrogate.orbit(&self.tangent.linearised, moved, &mut self.predicted.at_mean_drive);
@@ -225,7 +228,10 @@ impl<
 
     /// Median of the recent kicks of a corrector, whatever share of them is the same.
     fn median_kick(&self, c: usize) -> f32 {
-        median(|| self.past.recent.iter().filter_map(|frame| frame.drive.kick.get(c)).copied())
+        let mut kicks = [0.0; RECENT];
+        let recent = kicks.iter_mut().zip(self.past.recent.iter());
+        recent.for_each(|(to, frame)| *to = frame.drive.kick.get(c).copied().unwrap_or_default());
+        median(&kicks)
     }
 
     /// How the correctors that are not moved scatter about the reference in the recent frames; none if that is not noticed, or if no corrector
@@ -239,8 +245,8 @@ impl<
             *variance = rest.kick.iter().map(|kick| kick * kick).sum::<f32>() / others;
             *orbit = self.noticed(model, &rest);
         }
-        let kick = libm::sqrtf(median(|| variance.iter().copied()));
-        let orbit = median(|| orbit.iter().copied());
+        let kick = libm::sqrtf(median(&variance));
+        let orbit = median(&orbit);
         if orbit > 1.0 / REACHES && most > STANDS_OUT * kick {
             Scatter { kick, orbit: REACHES * orbit }
         } else {
@@ -254,6 +260,7 @@ impl<
     }
 
     /// Largest kick off the reference in a recent frame [rad], and the others.
+    #[inline(never)]
     fn moved_in_recent(&self, at: usize) -> Option<(f32, Drive<C, F>)> {
         let mut moved = self.past.reference.moved(&self.past.recent.get(at)?.drive);
         let largest = moved.kick.iter_mut().reduce(|a, b| if b.abs() > a.abs() { b } else { a })?;
@@ -263,9 +270,10 @@ impl<
 
 /// Median of some values, whatever share of them is the same: the mean of the smallest that half of them do not exceed, and of the largest that
 /// half of them do not fall short of.
-fn median<I: Iterator<Item = f32>>(values: impl Fn() -> I) -> f32 {
-    let half = values().count() / 2;
-    let low = values().filter(|value| values().filter(|other| other <= value).count() >= half);
-    let high = values().filter(|value| values().filter(|other| other >= value).count() >= half);
-    0.5 * (low.fold(f32::MAX, f32::min) + high.fold(f32::MIN, f32::max))
+#[inline(never)]
+fn median(values: &[f32; RECENT]) -> f32 {
+    let half = RECENT / 2;
+    let low = values.iter().filter(|value| values.iter().filter(|other| other <= value).count() >= half);
+    let high = values.iter().filter(|value| values.iter().filter(|other| other >= value).count() >= half);
+    0.5 * (low.copied().fold(f32::MAX, f32::min) + high.copied().fold(f32::MIN, f32::max))
 }
