@@ -61,7 +61,7 @@ class Ring:
     @classmethod
     def booster(cls) -> Ring:
         """The built-in AGS Booster: 48 quadrupoles, 33 monitors that are read, 48 correctors."""
-        return cls._of(_orbitcal.Ring.booster())
+        return cls._of(_orbitcal.Ring.built_in())
 
     @classmethod
     def from_pyat(cls, lattice: at.Lattice, *, monitors: Patterns = (), correctors: Patterns = ()) -> Ring:

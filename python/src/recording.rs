@@ -114,6 +114,12 @@ impl Recording {
         Ok(Self::of_frames(read(&folder, &ring.ring).map_err(input)?, &ring.ring))
     }
 
+    /// The lattice that the header in a folder names, if it does.
+    #[staticmethod]
+    fn lattice(folder: PathBuf) -> Option<String> {
+        inference::Recording::lattice(&folder)
+    }
+
     /// The texts of `header.toml` and `frames.csv`; `name` appears in errors.
     #[staticmethod]
     fn parse(name: &str, ring: &Ring, header: &str, frames: &str) -> PyResult<Self> {

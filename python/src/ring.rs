@@ -9,15 +9,12 @@ use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use results::factors;
-use twin::{Effect, EffectText, Machine, Rf};
+use twin::{BUILT_IN, Effect, EffectText, Machine, Rf};
 
 use crate::array::{matrices, matrix};
 use crate::error::input;
 use crate::response::{by_parameter, jacobian, response, table};
 use crate::source::{Imported, Source};
-
-/// What the built-in machine file is called.
-const BOOSTER: (&str, &str) = (include_str!("../../machines/booster.json"), "booster.json");
 
 /// What makes a ring again: text and name of its file, patterns of monitors and correctors of a lattice, vars, prior width and range.
 type State = (String, String, Option<(Vec<String>, Vec<String>)>, Vec<f64>, Option<f64>, Option<[f64; 2]>);
@@ -104,10 +101,13 @@ pub fn rf_of(word: &str) -> PyResult<Rf> {
 
 #[pymethods]
 impl Ring {
-    /// The built-in AGS Booster.
+    /// A built-in machine by the name of its file; the first without one, or with one that is not built in.
     #[staticmethod]
-    fn booster() -> PyResult<Self> {
-        Self::machine(BOOSTER.0.into(), BOOSTER.1.into())
+    #[pyo3(signature = (file=None))]
+    fn built_in(file: Option<&str>) -> PyResult<Self> {
+        let [first, _] = BUILT_IN;
+        let (name, text) = BUILT_IN.into_iter().find(|(name, _)| Some(*name) == file).unwrap_or(first);
+        Self::machine(text.into(), name.into())
     }
 
     /// The ring of a machine file's text; `file` appears in errors.

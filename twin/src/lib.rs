@@ -40,8 +40,8 @@ pub use effects::{
 };
 pub use factors::ResponseFactors;
 pub use lattice::{
-    Bend, Corrector, Currents, DipoleLaw, Element, Kind, LatticeError, MagnetLaw, Misalignment, Monitor, Parameter,
-    ParameterPrior, Particle, Plane, Polynomial, Quadrupole, RampPoint, Ring, Supply, Weights, unreadable,
+    BUILT_IN, Bend, Corrector, Currents, DipoleLaw, Element, Kind, LatticeError, MagnetLaw, Misalignment, Monitor,
+    Parameter, ParameterPrior, Particle, Plane, Polynomial, Quadrupole, RampPoint, Ring, Supply, Weights, unreadable,
 };
 pub use map::Phase;
 pub use orbit::{ClosedOrbit, Hold, OrbitError};

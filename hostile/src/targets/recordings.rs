@@ -27,8 +27,14 @@ static HEADER: LazyLock<String> = LazyLock::new(|| text("recordings/paper-vars/h
 static FRAMES: LazyLock<String> =
     LazyLock::new(|| text("recordings/paper-vars/frames.csv").split_inclusive('\n').take(40).collect());
 
-fn machines() -> [Vec<u8>; 3] {
-    ["machines/booster.json", "recordings/ten-cells/ring.json", "recordings/three-families/ring.json"].map(file)
+fn machines() -> [Vec<u8>; 4] {
+    [
+        "machines/booster.json",
+        "machines/booster-deck.json",
+        "recordings/ten-cells/ring.json",
+        "recordings/three-families/ring.json",
+    ]
+    .map(file)
 }
 
 fn headers() -> Vec<Vec<u8>> {

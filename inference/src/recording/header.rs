@@ -256,6 +256,15 @@ pub(super) fn format(file: &Path, text: &str) -> Result<Format, RecordingError> 
     Text { file, text }.format()
 }
 
+/// The lattice that a header names.
+pub(super) fn lattice(text: &str) -> Option<String> {
+    #[derive(Deserialize)]
+    struct Probe {
+        lattice: String,
+    }
+    toml::from_str(text).ok().map(|Probe { lattice }| lattice)
+}
+
 /// What is wrong with the value of a key.
 pub(super) fn refuse(file: &Path, text: &str, key: &str, what: &str) -> RecordingError {
     Text { file, text }.refuse_key(key, what)

@@ -55,6 +55,11 @@ impl Recording {
         Self::of_texts(folder, ring, &header, || text(&folder.join(FRAMES), FILE))
     }
 
+    /// File name of the machine's lattice as a campaign's header states it; none where it cannot be read, of which [`Recording::read`] says why.
+    pub fn lattice(folder: &Path) -> Option<String> {
+        header::lattice(&text(&folder.join(HEADER), SETTINGS).ok()?)
+    }
+
     /// The same from the texts of the two files; `folder` gives the recording its name and appears in errors.
     ///
     /// # Errors

@@ -7,10 +7,9 @@ use results::output::{fill, table};
 use results::{CommandError, recording};
 use schemars::JsonSchema;
 use serde::Serialize;
-use twin::Ring;
 use validation::{Challenge, Scored, Truth, folders};
 
-use super::{check_outputs, deliver, machine, progress};
+use super::{check_outputs, deliver, machine_for, progress};
 use crate::cli;
 
 /// Run it.
@@ -19,12 +18,11 @@ use crate::cli;
 /// [`CommandError`].
 pub fn run(options: &cli::Challenge) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref()])?;
-    let ring = machine(options.common.machine.as_deref())?;
     let folders = folders(&options.folder).map_err(|error| CommandError::Input(error.to_string()))?;
     let bar = progress(folders.len(), "recordings", options.common.quiet);
     let (mut recordings, mut refused) = (Vec::new(), Vec::new());
     for folder in &folders {
-        match scored(&ring, folder) {
+        match scored(options.common.machine.as_deref(), folder) {
             Ok(one) => recordings.push(one),
             // the others are not lost with it
             Err(error) => refused.push(error),
@@ -46,10 +44,11 @@ pub fn run(options: &cli::Challenge) -> Result<(), CommandError> {
 }
 
 /// One recording.
-fn scored(ring: &Ring, folder: &Path) -> Result<Scored, CommandError> {
-    let recording = recording(folder, ring)?;
-    let truth = Truth::read(folder, ring).map_err(|error| CommandError::Input(error.to_string()))?;
-    Ok(Scored::of(ring, &recording, &truth)?)
+fn scored(machine: Option<&Path>, folder: &Path) -> Result<Scored, CommandError> {
+    let ring = machine_for(folder, machine)?;
+    let recording = recording(folder, &ring)?;
+    let truth = Truth::read(folder, &ring).map_err(|error| CommandError::Input(error.to_string()))?;
+    Ok(Scored::of(&ring, &recording, &truth)?)
 }
 
 /// Scores for a person.

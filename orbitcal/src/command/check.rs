@@ -2,7 +2,7 @@
 
 use results::CheckResult;
 
-use super::{CommandError, check_outputs, deliver, machine, recording};
+use super::{CommandError, check_outputs, deliver, machine_for, recording};
 use crate::cli::Check;
 
 /// Run it.
@@ -11,6 +11,6 @@ use crate::cli::Check;
 /// [`CommandError`].
 pub fn run(options: &Check) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref()])?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_for(&options.recording, options.common.machine.as_deref())?;
     deliver(&options.common, &CheckResult::of(&ring, &recording(&options.recording, &ring)?)?)
 }

@@ -23,7 +23,7 @@ pub fn run(options: &Compare) -> Result<(), CommandError> {
             compared?
         }
         [false, false] => {
-            let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
+            let ring = machine_with(&options.before, options.common.machine.as_deref(), &options.priors)?;
             let [before, after] = [&options.before, &options.after].map(|path| recording(path, &ring));
             compare_recordings(&ring, [&before?, &after?], |_| ())?
         }

@@ -9,7 +9,7 @@ use results::output;
 use serde_json::{Value, json};
 use validation::{Cases, Class};
 
-use super::{CommandError, campaign, machine, matrix, recording};
+use super::{CommandError, campaign, machine_for, matrix, recording};
 use crate::cli::Conceal;
 
 /// Run it.
@@ -39,7 +39,7 @@ fn key_of(out: &Path) -> PathBuf {
 }
 
 fn into_recording(options: &Conceal) -> Result<Value, CommandError> {
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_for(&options.data, options.common.machine.as_deref())?;
     let given = recording(&options.data, &ring)?;
     let campaign = campaign(&ring, &given)?;
     let cases = Cases::of(&campaign).map_err(|error| CommandError::Input(error.to_string()))?;

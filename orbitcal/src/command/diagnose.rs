@@ -32,7 +32,8 @@ pub fn run(options: &Diagnose) -> Result<(), CommandError> {
     }
     let outputs = [&options.common.json, &options.report, &options.model_out, &options.plan_out];
     check_outputs(outputs.map(Option::as_deref))?;
-    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
+    let Some(first) = options.recordings.first() else { return Ok(()) };
+    let ring = machine_with(first, options.common.machine.as_deref(), &options.priors)?;
     let recordings = recordings(&options.recordings, &ring)?;
     let Some((recording, others)) = recordings.split_first() else { return Ok(()) };
     let bar = progress(5, "", options.common.quiet);

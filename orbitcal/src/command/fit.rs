@@ -26,7 +26,7 @@ pub fn run(options: &Fit) -> Result<(), CommandError> {
         return matrix::fit(options);
     }
     check(options)?;
-    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
+    let ring = machine_with(&options.recording, options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     let result = match options.method {
         Method::Map => with_spinner(options, &ring, &recording)?,

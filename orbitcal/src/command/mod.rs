@@ -83,9 +83,22 @@ fn machine(path: Option<&Path>) -> Result<Ring, LatticeError> {
     path.map_or_else(|| Ok(Ring::booster()), Ring::read)
 }
 
+/// The machine of a recording: the one that was asked for, or the built-in one that its header names.
+fn machine_for(recording: &Path, path: Option<&Path>) -> Result<Ring, LatticeError> {
+    machine_named(Recording::lattice(recording).as_deref(), path)
+}
+
+/// The machine that was asked for, or the built-in one of a file name.
+fn machine_named(lattice: Option<&str>, path: Option<&Path>) -> Result<Ring, LatticeError> {
+    match (path, lattice.and_then(Ring::built_in)) {
+        (None, Some(ring)) => Ok(ring),
+        _ => machine(path),
+    }
+}
+
 /// The same with the priors that were asked for.
-fn machine_with(path: Option<&Path>, priors: &Priors) -> Result<Ring, LatticeError> {
-    Ok(with_priors(&machine(path)?, priors.prior_width, priors.range))
+fn machine_with(recording: &Path, path: Option<&Path>, priors: &Priors) -> Result<Ring, LatticeError> {
+    Ok(with_priors(&machine_for(recording, path)?, priors.prior_width, priors.range))
 }
 
 /// The core's tables: those of a model file, or of the ring as designed.

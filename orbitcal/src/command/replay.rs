@@ -20,7 +20,7 @@ const MICRO: f32 = 1e-6;
 /// [`CommandError`].
 pub fn run(options: &Replay) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
-    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
+    let ring = machine_with(&options.recording, options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     warn_if_not_modelled(&ring, &recording, options.model_file.is_some());
     let powered = recording.powered(&ring);

@@ -15,7 +15,8 @@ use training::{LINE, Tables};
 use twin::Ring;
 
 use super::{
-    CommandError, check_outputs, deliver, machine, progress, recording, sinks, stream_all, tables, warn_if_not_modelled,
+    CommandError, check_outputs, deliver, machine, machine_for, progress, recording, sinks, stream_all, tables,
+    warn_if_not_modelled,
 };
 use crate::cli::Serve;
 
@@ -42,7 +43,8 @@ fn relay(options: &Serve, source: &Address) -> Result<(), CommandError> {
         return Err(CommandError::Input("--no-publish needs --trace or --feed: estimates would go nowhere".into()));
     }
     check_outputs([options.common.json.as_deref(), options.trace.as_deref()])?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let asked = options.common.machine.as_deref();
+    let ring = options.feed.as_ref().map_or_else(|| machine(asked), |feed| machine_for(feed, asked))?;
     let recording = options.feed.as_ref().map(|path| recording(path, &ring)).transpose()?;
     let link = Link::open(source).map_err(CommandError::other)?;
     match recording {

@@ -12,7 +12,7 @@ use crate::cli::Study;
 /// [`CommandError`].
 pub fn run(options: &Study) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), Some(&options.report)])?;
-    let ring = machine_with(options.common.machine.as_deref(), &options.priors)?;
+    let ring = machine_with(&options.recording, options.common.machine.as_deref(), &options.priors)?;
     let recording = recording(&options.recording, &ring)?;
     expect_modelled(&recording)?;
     let bar = progress(1, "", options.common.quiet);

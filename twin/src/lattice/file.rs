@@ -105,11 +105,25 @@ struct Entry {
 /// Largest gap or overlap between neighbours that counts as rounding of the file's numbers [m].
 const ROUNDING: f64 = 1e-6;
 
+/// Built-in machines: names and texts of their files. The first is taken where none is named.
+pub const BUILT_IN: [(&str, &str); 2] = [
+    ("booster.json", include_str!("../../../machines/booster.json")),
+    ("booster-deck.json", include_str!("../../../machines/booster-deck.json")),
+];
+
 impl Ring {
     /// The AGS Booster of `machines/booster.json`.
     pub fn booster() -> Self {
-        Self::parse(include_str!("../../../machines/booster.json"), "booster.json")
-            .expect("the built-in machine file is tested")
+        Self::of_built_in(BUILT_IN[0])
+    }
+
+    /// A built-in machine by the name of its file, as headers of recordings state it.
+    pub fn built_in(file: &str) -> Option<Self> {
+        BUILT_IN.into_iter().find(|(name, _)| *name == file).map(Self::of_built_in)
+    }
+
+    fn of_built_in((file, text): (&str, &str)) -> Self {
+        Self::parse(text, file).expect("the built-in machine files are tested")
     }
 
     /// Read a machine file.

@@ -14,6 +14,7 @@ mod ring;
 pub use currents::{Currents, DipoleLaw, MagnetLaw, Polynomial, Weights};
 pub use element::{Bend, Element, Kind, Misalignment, Plane};
 pub use error::{LatticeError, unreadable};
+pub use file::BUILT_IN;
 pub use parameter::{Parameter, ParameterPrior, Quadrupole, Supply};
 pub use particle::Particle;
 pub use ramp::RampPoint;
