@@ -20,6 +20,8 @@ use crate::output::{fill, table};
 #[derive(Debug, Serialize, JsonSchema)]
 pub struct DiagnosisResult {
     recording: String,
+    /// File name of the machine's lattice.
+    lattice: String,
     /// Those that were analysed together, if several.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     recordings: Vec<String>,
@@ -166,6 +168,7 @@ impl DiagnosisResult {
         let (next, tunes) = (&found.next, tunes_of(diagnosis));
         Ok(Self {
             recording: data.names(" + "),
+            lattice: ring.file.clone(),
             recordings: if data.is_joint() {
                 data.campaigns().map(|own| own.name.clone()).collect()
             } else {

@@ -36,6 +36,8 @@ use crate::record::{EstimateRecord, Remarked};
 #[allow(missing_docs)] // named after what they are
 pub struct FitResult {
     pub recording: String,
+    /// File name of the machine's lattice.
+    pub lattice: String,
     pub method: &'static str,
     pub model: &'static str,
     pub frames: usize,
@@ -165,6 +167,7 @@ impl FitResult {
         let tunes = tunes(&recording.powered(ring), last, &seen.mean_supplies());
         Ok(Self {
             recording: recording.name.clone(),
+            lattice: recording.header.lattice.clone(),
             method: "laplace",
             model,
             frames: last.frames.saturating_sub(last.remarked.put_aside_frames) as usize,
@@ -232,6 +235,7 @@ impl FitResult {
         let of_places = |(optics, (sigma, _)): &OpticsFunctions| optics_at(ring, &places(ring), &optics.twiss, sigma);
         Self {
             recording: campaign.recording.name.clone(),
+            lattice: campaign.recording.header.lattice.clone(),
             method: "",
             model: "",
             frames: campaign.frames(),

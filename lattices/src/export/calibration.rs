@@ -15,6 +15,8 @@ const DECISIVE: f64 = 0.95;
 pub struct Calibration {
     /// The recording.
     pub recording: String,
+    /// File name of the lattice of its machine, if the result states it.
+    pub lattice: Option<String>,
     /// Names and factors of the params that were fitted, and of dipoles with a gradient.
     pub strengths: Vec<(String, f64)>,
     /// Gradients [1/m^2] that are added to magnets by their names.
@@ -63,6 +65,16 @@ pub enum CalibrationError {
         /// The machine.
         machine: String,
     },
+    /// The result is of another machine, whose vars may have the same names.
+    #[error("{path}, key lattice: expected {expected:?}, found {found:?}: the result is of another machine")]
+    Lattice {
+        /// The file.
+        path: String,
+        /// That of the machine.
+        expected: String,
+        /// That of the result.
+        found: String,
+    },
     /// A var without a result.
     #[error("{path}: expected a var {name} of {machine}, found none")]
     Missing {
@@ -89,6 +101,7 @@ pub enum CalibrationError {
 struct ResultFile {
     #[serde(default)]
     recording: serde_json::Value,
+    lattice: Option<String>,
     vars: Option<Vec<Var>>,
     vars_after: Option<Vec<Var>>,
     #[serde(default)]
@@ -163,14 +176,19 @@ impl Calibration {
         let of_magnets = |one: Other| one.elements.into_iter().map(move |name| (name, one.mean));
         let added = file.other.into_iter().flat_map(of_magnets).collect();
         let tunes = file.tunes.map(|tunes| [tunes.x, tunes.y]);
-        Ok(Self { recording: recordings(&file.recording), strengths, added, tunes, findings, open })
+        let (recording, lattice) = (recordings(&file.recording), file.lattice);
+        Ok(Self { recording, lattice, strengths, added, tunes, findings, open })
     }
 
     /// The ring with the strengths that were found.
     ///
     /// # Errors
-    /// [`CalibrationError::Name`], [`CalibrationError::Missing`]: the result of another ring.
+    /// [`CalibrationError::Lattice`], [`CalibrationError::Name`], [`CalibrationError::Missing`]: the result of another ring.
     pub fn strengthened(&self, ring: &Ring, path: &Path) -> Result<Ring, CalibrationError> {
+        if let Some(found) = self.lattice.clone().filter(|lattice| *lattice != ring.file) {
+            let (path, expected) = (path.display().to_string(), ring.file.clone());
+            return Err(CalibrationError::Lattice { path, expected, found });
+        }
         let mut found = ring.with_vars(&self.vars(ring, path)?);
         for (name, factor) in &self.strengths {
             // that of a quadrupole is one of its param
@@ -288,6 +306,10 @@ mod tests {
         assert_eq!(
             message(r#"{"vars": [{"name": "A2", "mean": -1.0}]}"#),
             "fit.json: var A2: expected a mean above 0, found -1"
+        );
+        assert_eq!(
+            message(r#"{"lattice": "booster-deck.json", "vars": []}"#),
+            "fit.json, key lattice: expected \"booster.json\", found \"booster-deck.json\": the result is of another machine"
         );
         assert!(message("{").starts_with("fit.json: EOF while parsing"));
     }

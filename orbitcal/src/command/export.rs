@@ -8,7 +8,7 @@ use results::{Tunes, output};
 use schemars::JsonSchema;
 use serde::Serialize;
 
-use super::{CommandError, check_outputs, deliver, machine};
+use super::{CommandError, check_outputs, deliver, machine_named};
 use crate::cli::Export;
 
 /// What was written. Field names are those of the command's JSON.
@@ -34,9 +34,9 @@ pub fn run(options: &Export) -> Result<(), CommandError> {
         return Err(CommandError::Input("--json - needs --out FILE: both would go to stdout".into()));
     }
     check_outputs([Some(out), json])?;
-    let ring = machine(options.common.machine.as_deref())?;
     let input = |error: ExportError| CommandError::Input(error.to_string());
     let calibration = Calibration::read(&options.result).map_err(|error| input(error.into()))?;
+    let ring = machine_named(calibration.lattice.as_deref(), options.common.machine.as_deref())?;
     let lattice = Lattice::of(&ring, &calibration, &options.result).map_err(input)?;
     let (text, result) = (export::text(&lattice, options.format.into()), ExportResult::of(&lattice, options));
     if to_stdout {
