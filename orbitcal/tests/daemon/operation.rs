@@ -158,10 +158,13 @@ fn another_user_neither_reads_nor_disturbs_and_is_told_why() {
     let reset = ["request", "reset", "--service", &place.service];
     let output = as_stranger(&program, folder.path(), &reset).unwrap();
     assert_eq!(output.status.code(), Some(1), "{}", told(&output));
-    // with folders of their own both work, each with its own
-    fs::create_dir(folder.path().join("config")).unwrap();
+    // with folders of their own both work, each with its own; iceoryx2 changes this process's umask for a moment where it opens a socket
     let own = format!("[global]\nroot-path = {:?}\nprefix = \"stranger_\"\n", folder.path().join("iceoryx2"));
-    fs::write(folder.path().join("config/iceoryx2.toml"), own).unwrap();
+    let (config, file) = (folder.path().join("config"), folder.path().join("config/iceoryx2.toml"));
+    fs::create_dir(&config).unwrap();
+    fs::write(&file, own).unwrap();
+    fs::set_permissions(&config, fs::Permissions::from_mode(0o755)).unwrap();
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o644)).unwrap();
     let output = as_stranger(&program, folder.path(), &watch).unwrap();
     let said = told(&output);
     assert!(output.status.success() && said.contains("0 estimates seen"), "{said}");
