@@ -496,8 +496,8 @@ impl<
     #[inline(never)]
     pub fn learn(&mut self, model: &Model<'_, G, B, C, F>, judged: &mut Judged<B, C, F, W>) {
         if judged.remarks.put_aside {
-            // its drive tells where correctors stand, as long as there is room
-            if !self.past.recent.is_full() {
+            // its drive tells where correctors stand, as long as there is room and no setting tells it
+            if !self.past.recent.is_full() && self.past.campaign.cells().is_empty() {
                 self.keep_loose(model, &judged.frame, &judged.drive, &judged.screened);
             }
             return;
