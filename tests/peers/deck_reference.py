@@ -9,18 +9,15 @@ machines/booster-deck.json, apart from the program's own code.
 
 import json
 import sys
-import warnings
 from pathlib import Path
 
-import at
 import numpy as np
 from cpymad.madx import Madx
-
-warnings.filterwarnings("ignore", message="AT tracking still assumes beta==1")
+from pyat_response import response, ring_of
 
 ROOT = Path(__file__).resolve().parents[2]
 KICK = 1e-6  # rad
-SLICES = 40  # of pyAT's fourth-order integrator, in each magnet
+SLICES = 40  # of a magnet
 MASS = 0.93827208816  # GeV
 LIGHT = 0.299792458  # GeV/c per T m
 
@@ -47,42 +44,16 @@ def powered(machine):
 
 
 def by_pyat(elements, momentum, circumference):
-    line, end = [], 0.0
-    for e in elements:
-        if e["s_start"] - end > 1e-9:
-            line.append(at.Drift("D", e["s_start"] - end))
-        name, length = e["name"], e["length"]
-        match e["type"]:
-            case "corrector":
-                made = at.Corrector(name, 0.0, [0.0, 0.0])
-            case "bpm" | "marker":
-                made = at.Marker(name)
-            case "quadrupole":
-                made = at.Quadrupole(name, length, e["k1"], NumIntSteps=SLICES)
-            case "sextupole":
-                made = at.Sextupole(name, length, e["k2"] / 2, NumIntSteps=SLICES)
-            case "sbend":
-                field = [0.0, e["k1"], e["k2"] / 2]
-                made = at.Bend(name, length, e["angle"], e["k1"], PolynomB=field, MaxOrder=2, NumIntSteps=SLICES)
-        line.append(made)
-        end = e["s_start"] + length
-    if circumference - end > 1e-9:
-        line.append(at.Drift("D", circumference - end))
-    ring = at.Lattice(line, energy=1e9 * np.hypot(momentum, MASS), particle="proton", periodicity=1)
-    ring.disable_6d()
-    names = [e.FamName for e in ring]
-    fractions = ring.get_tune()
-
-    def orbit(corrector, plane, kick, monitors):
-        ring[names.index(corrector)].KickAngle[plane] = kick
-        _, orbits = ring.find_orbit4(refpts=[names.index(m) for m in monitors])
-        ring[names.index(corrector)].KickAngle[plane] = 0.0
-        return orbits[:, 2 * plane]
-
-    return [float(4 + q) for q in fractions], orbit
+    """Tunes, and the response of x to H and of y to V correctors."""
+    kinetic = float(np.hypot(momentum, MASS)) - MASS
+    machine = {"elements": elements, "k1": {}, "circumference_m": circumference, "reference": {"kinetic_energy_GeV": kinetic}}
+    ring, monitors, correctors = ring_of(machine, SLICES)
+    x, y = response(ring, monitors, correctors, KICK)
+    return [float(4 + q) for q in ring.get_tune()[:2]], [x[:24, :24], y[24:, 24:]]
 
 
 def by_madx(elements, momentum, circumference):
+    """The same."""
     madx = Madx(stdout=False)
     lines = [f"beam, particle=proton, pc={momentum!r};"]
     for e in elements:
@@ -109,7 +80,12 @@ def by_madx(elements, momentum, circumference):
         at_name = {name.split(":")[0]: i for i, name in enumerate(table.name)}
         return np.array([table["xy"[plane]][at_name[m.lower()]] for m in monitors])
 
-    return [float(tunes.q1), float(tunes.q2)], orbit
+    def of_plane(plane):
+        names = lambda sort: [e["name"] for e in elements if e["type"] == sort and e["plane"] == "HV"[plane]]
+        swing = lambda c: orbit(c, plane, KICK, names("bpm")) - orbit(c, plane, -KICK, names("bpm"))
+        return np.array([swing(c) / (2 * KICK) for c in names("corrector")]).T
+
+    return [float(tunes.q1), float(tunes.q2)], [of_plane(0), of_plane(1)]
 
 
 def main():
@@ -123,13 +99,9 @@ def main():
             for e in scaled:
                 if e["type"] == "quadrupole":
                     e["k1"] *= factors.get(e["name"][3:], 1.0)
-            tunes, orbit = make(scaled, momentum, machine["circumference_m"])
-            one = {"tunes": tunes}
-            for plane, letter in enumerate("HV"):
-                named = lambda sort: [e["name"] for e in elements if e["type"] == sort and e["plane"] == letter]
-                monitors, correctors = named("bpm"), named("corrector")
-                columns = [(orbit(c, plane, KICK, monitors) - orbit(c, plane, -KICK, monitors)) / (2 * KICK) for c in correctors]
-                one["xy"[plane]] = [[round(float(r), 6) for r in row] for row in np.array(columns).T]
+            tunes, planes = make(scaled, momentum, machine["circumference_m"])
+            rows = lambda matrix: [[round(float(r), 6) for r in row] for row in matrix]
+            one = {"tunes": tunes, "x": rows(planes[0]), "y": rows(planes[1])}
             result.setdefault(word, {})[machine_word] = one
             print(word, machine_word, tunes)
     Path(sys.argv[1]).write_text(json.dumps(result) + "\n")

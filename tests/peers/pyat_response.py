@@ -29,13 +29,13 @@ STEPS = 20  # of a quadrupole, as in the golden file: 10 are off by 7e-5 m/rad; 
 TOLERANCE = 2e-6  # m/rad: six decimals in the golden file, and the closed orbit's own convergence
 
 
-def ring_of(machine):
+def ring_of(machine, steps=STEPS):
     """The machine file as pyAT elements, gaps filled with drifts; also the places of monitors and correctors."""
     elements, end = [], 0.0
     for e in machine["elements"]:
         if e["s_start"] - end > 1e-9:
             elements.append(at.Drift("D", e["s_start"] - end))
-        elements.append(element_of(e, machine["k1"]))
+        elements.append(element_of(e, machine["k1"], steps))
         end = e["s_start"] + e["length"]
     if machine["circumference_m"] - end > 1e-9:
         elements.append(at.Drift("D", machine["circumference_m"] - end))
@@ -47,7 +47,7 @@ def ring_of(machine):
     return ring, places(ring, "PU"), places(ring, "DC")
 
 
-def element_of(e, k1):
+def element_of(e, k1, steps):
     name, length = e["name"], e["length"]
     match e["type"]:
         case "corrector":
@@ -58,11 +58,16 @@ def element_of(e, k1):
             return at.Marker(name)
         case "sextupole" if e.get("k2", 0.0) == 0.0:
             return at.Drift(name, length)
+        case "sextupole":
+            return at.Sextupole(name, length, e["k2"] / 2, NumIntSteps=steps)
         case "quadrupole":
             strength = e.get("k1", k1.get(e.get("family")))
-            return at.Quadrupole(name, length, strength, PassMethod="ExactMultipolePass", NumIntSteps=STEPS)
-        case "sbend":
+            return at.Quadrupole(name, length, strength, PassMethod="ExactMultipolePass", NumIntSteps=steps)
+        case "sbend" if e.get("k1", 0.0) == 0.0:
             return at.Dipole(name, length, e["angle"], PassMethod="ExactSectorBendPass", NumIntSteps=1)
+        case "sbend":
+            body = [0.0, e["k1"], e["k2"] / 2]
+            return at.Dipole(name, length, e["angle"], e["k1"], PolynomB=body, MaxOrder=2, NumIntSteps=steps)
     raise SystemExit(f"element {name}: no pyAT element for type {e['type']!r}")
 
 
@@ -77,7 +82,7 @@ def places(ring, prefix):
     return [i for plane in "HV" for i, name in enumerate(names) if name.startswith(f"{prefix}{plane}_")]
 
 
-def response(ring, monitors, correctors):
+def response(ring, monitors, correctors, kick=KICK):
     """x and y at the monitors per kick [m/rad], shape (2, monitors, correctors)."""
     order = np.argsort(monitors)
     refpts = np.asarray(monitors)[order]
@@ -87,11 +92,11 @@ def response(ring, monitors, correctors):
         orbits = []
         for sign in (1, -1):
             angle = [0.0, 0.0]
-            angle[plane] = sign * KICK
+            angle[plane] = sign * kick
             ring[corrector].KickAngle = angle
             orbits.append(at.find_orbit4(ring, 0.0, refpts)[1][:, [0, 2]])
         ring[corrector].KickAngle = [0.0, 0.0]
-        answer[:, order, j] = ((orbits[0] - orbits[1]) / (2 * KICK)).T
+        answer[:, order, j] = ((orbits[0] - orbits[1]) / (2 * kick)).T
     return answer
 
 
