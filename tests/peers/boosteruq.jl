@@ -2,7 +2,7 @@
 #
 #     julia --project=ENVIRONMENT tests/peers/boosteruq.jl PATH/TO/BoosterUQ target/boosteruq/pairs.csv
 #
-# Never run here: this machine has no Julia. Written after BoosterUQ's API guide.
+# Not run yet; written after BoosterUQ's API guide.
 
 using DelimitedFiles, Statistics, Turing
 

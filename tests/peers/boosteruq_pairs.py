@@ -61,11 +61,9 @@ def response(names, params, monitors):
         file.flush()
         done = subprocess.run([ORBITCAL, "response", "--machine", ROOT / "machines/booster-deck.json", "--vars", file.name, "--json", "-"], capture_output=True, check=True)
     made = json.loads(done.stdout)
-    places = {name: i for i, name in enumerate(made["bpm"])}
+    at = {label: i for i, label in enumerate(made["bpm"])}
     planes = {plane: np.array(made[f"response_{plane}_m_per_rad"]) for plane in "xy"}
-    label = lambda place: place[-2:]
-    at = {label(name): i for name, i in places.items()}
-    return 1e3 * np.array([planes[name[0]][at[name[2:4]]] for name in monitors])
+    return 1e3 * np.array([planes[plane][at[label]] for plane, label, _ in (name.split("_") for name in monitors)])
 
 
 def fit(names, rows, monitors, start, count):
