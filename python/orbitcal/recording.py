@@ -44,8 +44,8 @@ class Recording:
         Without a ring the frames are those of the built-in Booster that the header names; a matrix has the ring of its own lattice. Frames that were taken at another energy than
         the ring's are refused, but for `any_energy`: `diagnose` takes several of different energies together.
         """
-        named = _orbitcal.Recording.lattice(Path(folder))
-        of_frames = Ring._of(_orbitcal.Ring.built_in(named)) if ring is None else ring
+        if (of_frames := ring) is None:
+            of_frames = Ring._of(_orbitcal.Ring.built_in(_orbitcal.Recording.lattice(Path(folder))))
         made = _orbitcal.Recording.read(Path(folder), of_frames._ring, any_energy)
         return cls(made, Ring._of(made.ring_of_matrix()) if made.is_matrix and ring is None else of_frames)
 

@@ -105,8 +105,7 @@ impl Ring {
     #[staticmethod]
     #[pyo3(signature = (file=None))]
     fn built_in(file: Option<&str>) -> PyResult<Self> {
-        let [first, _] = BUILT_IN;
-        let (name, text) = BUILT_IN.into_iter().find(|(name, _)| Some(*name) == file).unwrap_or(first);
+        let (name, text) = BUILT_IN.into_iter().find(|(name, _)| Some(*name) == file).unwrap_or(BUILT_IN[0]);
         Self::machine(text.into(), name.into())
     }
 
