@@ -29,6 +29,7 @@ use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
 use super::linearisation::about_itself;
 use super::scan::SignatureScore;
+use super::term::Term;
 
 /// Pools that are left out together, counted through all recordings.
 pub type Block = Vec<usize>;
@@ -298,9 +299,21 @@ pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
 /// # Errors
 /// [`FitError`].
 pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
-    let terms = &fitted.hypothesis.terms;
-    let none = fitted.hypothesis.without_terms(|_| true).without_element();
-    lessened(data, fitted, terms.iter().fold(none, |less, term| less.without_family(*term, data)))
+    without_terms(data, fitted, &fitted.hypothesis.terms, &fitted.hypothesis.without_element())
+}
+
+/// The same fit without one of its terms, to compare its predictions with.
+///
+/// # Errors
+/// [`FitError`].
+pub fn rival(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
+    without_terms(data, fitted, &fitted.hypothesis.terms[term..=term], &fitted.hypothesis)
+}
+
+/// The fit of a hypothesis without some terms, and without the families that predict as these do.
+fn without_terms(data: &Data, fitted: &Fitted, terms: &[Term], from: &Hypothesis) -> Result<Fitted, FitError> {
+    let less = from.without_terms(|term| terms.contains(term));
+    lessened(data, fitted, terms.iter().fold(less, |less, term| less.without_family(*term, data)))
 }
 
 /// The same fit without one of its terms.

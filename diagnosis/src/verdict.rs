@@ -12,7 +12,7 @@ use super::error::FitError;
 use super::experiment::Menu;
 use super::family::family_of;
 use super::fit::Fitted;
-use super::heldout::{Block, Score, gain_of_choice, lessened};
+use super::heldout::{Block, Score, gain_of_choice, lessened, rival};
 use super::limits::Limits;
 use super::location::Location;
 use super::lost_frames::LostFrames;
@@ -313,9 +313,7 @@ pub fn tests(
     let test = |i: usize| -> Result<Tested, FitError> {
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
         let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
-        let all = &found.best.hypothesis;
-        let less = || lessened(data, &found.best, all.without(i).without_family(all.terms[i], data));
-        let without = &if is_all { bare.clone() } else { less()? };
+        let without = &if is_all { bare.clone() } else { rival(data, &found.best, i)? };
         let rival = if is_all { before } else { &Score::from_blocks(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_poor() {
