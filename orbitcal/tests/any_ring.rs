@@ -171,7 +171,12 @@ fn a_wrong_kick_constant_is_said() {
         let pull = (number(&kick["mean"]) - (0.08 / 0.1 - 1.0)) / number(&kick["sigma"]);
         assert!(pull.abs() < 3.5, "{kick}");
     }
-    assert!(text(&["fit", &folder]).contains("off throughout the ring: kick constant, H -2"));
+    let page = home.path().join("page.html");
+    let said = text(&["fit", &folder, "--report", page.to_str().unwrap()]);
+    let page = std::fs::read_to_string(page).unwrap();
+    for what in [said, page] {
+        assert!(what.contains("off throughout the ring: kick constant, H -2"), "{what}");
+    }
 }
 
 #[test]

@@ -58,9 +58,10 @@ impl<'r> Calibrated<'r> {
         let (tunes, sigma) = (self.optics.tunes, self.sigma.1);
         let beats = [0, 1].map(|plane| self.beats(plane).0);
         let rms = beats.map(|beat| (beat.iter().map(|b| b * b).sum::<f64>() / beat.len() as f64).sqrt());
+        let off = self.result.throughout().map_or_else(String::new, |off| format!(" The design is {off}."));
         format!(
             "{} frames, method {}, chi2/dof {}. Tunes {:.4} ± {:.4} and {:.4} ± {:.4}; rms beta-beat {:.1} % in x and {:.1} % \
-             in y against the design.",
+             in y against the design.{off}",
             self.result.frames,
             self.result.method,
             self.result.chi2(),

@@ -284,11 +284,16 @@ impl FitResult {
         self.chi2_per_dof.map_or_else(|| "-".into(), |chi2| format!("{chi2:.4}"))
     }
 
+    /// What of the design is off by more than ordinary, in words.
+    pub(crate) fn throughout(&self) -> Option<String> {
+        self.off.as_ref().map(|off| format!("{THROUGHOUT}: {off}"))
+    }
+
     /// What a reader has to know before using the numbers.
     fn remarks(&self) -> Vec<String> {
         let clipped: Vec<&str> = self.vars.iter().filter(|v| v.clipped).map(|v| v.name.as_str()).collect();
         let remarks = [
-            self.off.as_ref().map(|off| format!("{THROUGHOUT}: {off}")),
+            self.throughout(),
             self.lack.as_ref().map(|lack| format!("{lack}: the result is the prior, but for measured tunes")),
             self.tunes.and_then(|tunes| self.tunes_measured.remark(&tunes)),
             (!clipped.is_empty()).then(|| format!("* at a bound of the prior's range: {}", clipped.join(", "))),
