@@ -382,25 +382,27 @@ fn across(orbit: &[[f64; 2]], at: usize) -> [f64; 2] {
 impl Machine {
     /// The same machine as small deviations from its orbit without kicks (x, y) see it: each stray sextupole is a gradient `k2 x`
     /// and a skew gradient `k2 y`, which together are a rolled quadrupole; in a dipole it is the gradient, and the skew one belongs to what
-    /// crosses it. An octupole is a gradient `K3L (x^2 - y^2)/2` and a skew gradient `K3L x y`. Their dipole parts are in the orbit already.
+    /// crosses it. An octupole is a gradient `K3L (x^2 - y^2)/2` and a skew gradient `K3L x y`. Their dipole parts are in the orbit already. Fields of the
+    /// ring itself stay as they are: what their feed-down does is in the strengths.
     #[must_use]
     pub fn on_orbit(&self, orbit: &[[f64; 2]]) -> Self {
         let mut machine = self.clone();
-        for &Curved { element: at, k3l: own, .. } in &self.curved {
+        for &Curved { element: at, k2l, k3l } in &self.curved {
             let ([x, y], element) = (orbit[at], &mut machine.ring.elements[at]);
+            let k2 = k2l / element.length;
             match &mut element.kind {
-                Kind::Sextupole { k2 } => {
-                    element.kind = Kind::Quadrupole { k1: *k2 * x.hypot(y) };
+                Kind::Sextupole { .. } => {
+                    element.kind = Kind::Quadrupole { k1: k2 * x.hypot(y) };
                     element.misalignment.roll = -0.5 * y.atan2(x);
                 }
                 Kind::Bend(bend) => {
-                    bend.k1 += bend.k2 * across(orbit, at)[0];
-                    bend.k2 = 0.0;
+                    bend.k1 += k2 * across(orbit, at)[0];
+                    bend.k2 -= k2;
                 }
-                Kind::Multipole { k1l, k1sl, k3l, .. } => {
-                    *k1l += 0.5 * own * (x * x - y * y);
-                    *k1sl += own * x * y;
-                    *k3l -= own;
+                Kind::Multipole { k1l, k1sl, k3l: whole, .. } => {
+                    *k1l += 0.5 * k3l * (x * x - y * y);
+                    *k1sl += k3l * x * y;
+                    *whole -= k3l;
                 }
                 _ => {}
             }
