@@ -80,7 +80,7 @@ impl<const C: usize, const F: usize> Drive<C, F> {
     pub const NONE: Self = Self { kick: [0.0; C], strength: [0.0; F], rf_offset: 0.0 };
 }
 
-/// Largest kick of all correctors together [rad], 25 times that of one: beyond it first-order optics says nothing.
+/// Largest root of the sum of squared kicks [rad], as which an orbit grows: beyond it first-order optics says nothing.
 const KICKS: f32 = 5e-3;
 /// Largest `ln` of a common gradient factor, and of the dipole current over nominal: a tune moves by half a unit.
 const STRENGTH: f32 = 0.05;
@@ -136,7 +136,7 @@ impl<const C: usize, const F: usize> Calibration<C, F> {
         let mut kick = frame.corrector.map(CurrentCode::value);
         let stiffness = rigidity * at.momentum;
         kick.iter_mut().enumerate().for_each(|(c, kick)| *kick = *kick * self.kick_per_ampere.of(c) / stiffness);
-        within("sum of kicks in rad", kick.iter().map(|k| k.abs()).sum(), KICKS)?;
+        within("root of summed squares of kicks in rad", libm::sqrtf(kick.iter().map(|k| k * k).sum()), KICKS)?;
         let mut strength = [0.0; F];
         let each = self.supplies.iter().zip(frame.magnets.supply).zip(at.gradient);
         for (to, ((supply, current), gradient)) in strength.iter_mut().zip(each) {
