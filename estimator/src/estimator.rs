@@ -529,12 +529,17 @@ impl<
         }
         let prior = |i| prior_of::<G, B, C, F, N>(model, i);
         let walked = self.posterior.walk(&model.setup.walk, &model.surrogate.layout(), prior);
+        // what changes the past counts as a slice, or the number of slices would not tell whether it was done; frames that leave no time to
+        // linearise anew would else never belong to a setting
+        if !walked && self.seek_reference(model) {
+            self.slices = self.slices.saturating_add(1);
+            return Prepared::Slice;
+        }
         if !walked && !self.anew.under_way {
             if core::mem::replace(&mut self.looked, true) {
                 return Prepared::Nothing;
             }
-            // what changes the past counts as a slice, or the number of slices would not tell whether it was done
-            if self.seek_reference(model) || self.retire(model) {
+            if self.retire(model) {
                 self.looked = false;
                 self.slices = self.slices.saturating_add(1);
                 return Prepared::Slice;

@@ -82,6 +82,12 @@ impl<
             late: Deque::new(),
         }
     }
+
+    /// Stay with the old linearisation; a past that was due to be weighted anew is so still.
+    pub fn give_up(&mut self, stale: &mut bool) {
+        *stale |= self.under_way && self.reweighted;
+        self.under_way = false;
+    }
 }
 
 impl<
@@ -131,11 +137,7 @@ impl<
         match self.anew.attempts {
             ..ATTEMPTS => self.anew.to.iter_mut().zip(from).for_each(|(to, from)| *to = 0.5 * (*to + from)),
             ATTEMPTS => self.anew.to = *from,
-            _ => {
-                self.anew.under_way = false;
-                self.past.stale |= self.anew.reweighted;
-                return;
-            }
+            _ => return self.anew.give_up(&mut self.past.stale),
         }
         self.attempt();
     }

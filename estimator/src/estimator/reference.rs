@@ -170,6 +170,7 @@ impl<
         if 4 * repeats >= PARTS * recent {
             // not 0 again, which means that there is none
             self.past.reference.number = self.past.reference.number.checked_add(1).unwrap_or(1);
+            self.anew.give_up(&mut self.past.stale);
         } else {
             (self.past.reference.kick, self.past.reference.scatter) = former;
         }
