@@ -82,7 +82,8 @@ pub fn sealed(kind: u8, body: &[u8]) -> Vec<u8> {
 pub fn framed(plain: &[u8]) -> Vec<u8> {
     let mut wire = vec![0; cobs::max_encoding_length(plain.len()) + 1];
     let n = cobs::encode(plain, &mut wire);
-    wire.truncate(n + 1);
+    wire.truncate(n);
+    wire.push(0); // what stands there need not be one, after a full block
     wire
 }
 

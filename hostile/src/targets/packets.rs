@@ -81,7 +81,8 @@ fn sealed(kind: u8, body: &[u8]) -> Vec<u8> {
     plain.extend_from_slice(&CRC.checksum(&plain).to_le_bytes());
     let mut wire = vec![0; cobs::max_encoding_length(plain.len()) + 1];
     let length = cobs::encode(&plain, &mut wire);
-    wire.truncate(length + 1);
+    wire.truncate(length);
+    wire.push(0); // what stands there need not be one, after a full block
     wire
 }
 
