@@ -91,7 +91,7 @@ mod tests {
             (line["corrector"][1].as_str(), line["corrector"].as_array().unwrap().len()),
             (Some("BOOSTER:A4:READ"), 48)
         );
-        assert_eq!(line["rf"], serde_json::json!({"channel": "BOOSTER:RF:READ", "nominal_Hz": 1.371e6}));
+        assert_eq!(line["rf"], serde_json::json!({"channel": "BOOSTER:RF:READ", "nominal_Hz": 1.3768e6}));
         assert_eq!((line["count"].as_u64(), line["cycle_time_us"].as_u64()), (Some(33), Some(92_000)));
     }
 }

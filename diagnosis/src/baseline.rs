@@ -225,7 +225,7 @@ mod tests {
     /// The orbit at a monitor moves by that share of what its own reading does.
     #[test]
     fn the_share_of_a_monitor_is_how_far_its_reading_moves_the_orbit_there() {
-        let ring = Ring::booster();
+        let ring = Ring::paper_booster();
         let read = |moved: Option<usize>| -> Vec<Option<f64>> {
             let of = |b: usize| 3e-3 * (b as f64).sin() + if moved == Some(b) { 1e-3 } else { 0.0 };
             (0..ring.read_monitors.len()).map(|b| (b != 5).then(|| of(b))).collect()
@@ -246,7 +246,7 @@ mod tests {
     #[test]
     fn displaced_quadrupoles_move_the_momentum_that_a_frequency_sets() {
         const RINGS: u64 = 20;
-        let (ring, kick) = (Ring::booster(), 3e-5);
+        let (ring, kick) = (Ring::paper_booster(), 3e-5);
         let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
         let per_frequency = optics.dispersion_of(&optics.read_monitors()) / optics.slip_factor();
         let width = DVector::from_vec(lengthened(&ring, &optics, kick)).norm() / per_frequency.norm();

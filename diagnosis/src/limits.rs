@@ -51,7 +51,7 @@ mod tests {
 
     #[test]
     fn an_effect_at_its_limit_has_the_evidence_asked_for() {
-        let ring = Ring::booster();
+        let ring = Ring::paper_booster();
         let terms = EffectKind::BpmGain.sites(&ring).into_iter().map(|site| Term { kind: EffectKind::BpmGain, site });
         let of = |(i, term): (usize, Term)| Candidate {
             term,

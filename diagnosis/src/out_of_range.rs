@@ -58,7 +58,7 @@ mod tests {
 
     #[test]
     fn what_is_surely_outside_is_told() {
-        let ring = Ring::booster();
+        let ring = Ring::paper_booster();
         let n = ring.parameters.len();
         let mut vars = Vars { mean: DVector::zeros(n), covariance: DMatrix::identity(n, n) * 0.005_f64.powi(2) };
         let at = ring.parameters.iter().position(|one| one.name == "D8").unwrap();

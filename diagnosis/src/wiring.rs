@@ -581,15 +581,17 @@ mod tests {
     }
 
     fn booster(name: &str) -> (Ring, Recording) {
-        let ring = Ring::booster();
-        let recording = Recording::read(&folder().join(name), &ring).unwrap();
+        let at = folder().join(name);
+        let ring = Recording::lattice(&at).and_then(|lattice| Ring::built_in(&lattice)).unwrap();
+        let recording = Recording::read(&at, &ring).unwrap();
         (ring, recording)
     }
 
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn recordings_as_they_are_raise_no_alarm() {
-        let of_booster = ["paper-vars", "random-vars", "drift-stream"].map(String::from);
+        let of_booster =
+            ["paper-vars", "random-vars", "former/paper-vars", "former/random-vars", "drift-stream"].map(String::from);
         for name in of_booster.into_iter().chain((0..15).map(|i| format!("concealed/open-{i:02}"))) {
             let (ring, recording) = booster(&name);
             assert_eq!(judge(&ring, &recording), None, "{name}");
@@ -617,7 +619,7 @@ mod tests {
     fn every_wrong_wiring_is_said() {
         use Columns::{Kicks, Readings};
         let (x, y) = (Some(Plane::X), Some(Plane::Y));
-        for name in ["paper-vars", "concealed/open-05"] {
+        for name in ["former/paper-vars", "concealed/open-05"] {
             let (ring, recording) = booster(name);
             let (split, horizontal) = (ring.horizontal_monitors(), ring.horizontal_correctors());
             let kicks = |change: &dyn Fn(&mut [f64])| changed(&recording, |_, kicks| change(kicks));
@@ -653,7 +655,7 @@ mod tests {
 
     /// A simulated campaign of a machine, its quadrupoles stronger by a factor by plane.
     fn simulated(factors: [f64; 2], effects: &[Effect], seed: u64) -> Option<(Ring, Recording)> {
-        let (ring, template) = booster("paper-vars");
+        let (ring, template) = booster("former/paper-vars");
         let vars = simulate::vars(&ring, true, seed).unwrap();
         let of = |(m, var): (usize, &f64)| var * factors[usize::from(m >= vars.len() / 2)];
         let vars: Vec<f64> = vars.iter().enumerate().map(of).collect();
@@ -665,7 +667,7 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn an_imperfect_machine_or_one_at_other_tunes_raises_no_alarm() {
-        let ring = Ring::booster();
+        let ring = Ring::paper_booster();
         let wave = |i: usize, size: f64| size * f64::sin(2.4 * i as f64 + 0.3);
         let scattered = [
             (EffectKind::BpmGain, 0.06),

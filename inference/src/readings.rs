@@ -198,8 +198,8 @@ impl Readings {
         reduced.readings((0..reduced.campaign.monitors()).map(of_monitor).collect(), tunes, &reduced.base)
     }
 
-    /// Differences of frame pairs, each independent of the others; no tunes, as in the paper.
-    pub fn of_pairs(reduced: &Reduced, model: &ResponseModel, pairs: &[Pair]) -> Self {
+    /// Differences of frame pairs, each independent of the others; no tunes, as in the paper. `error` is that of the model in a difference, by monitor [m].
+    pub fn of_pairs(reduced: &Reduced, error: impl Fn(usize) -> f64, pairs: &[Pair]) -> Self {
         let of_monitor = |b: usize| {
             let terms = reduced.campaign.terms(b);
             let mut form = Form::new(reduced.campaign.ring.correctors.len() + 1);
@@ -210,7 +210,7 @@ impl Readings {
                 };
                 let k = reduced.drive(pair.last) - reduced.drive(pair.initial);
                 let moved = (terms.column(pair.last) - terms.column(pair.initial)).norm_squared();
-                let variance = 2.0 * reduced.noise(b).powi(2) + model.stated_error(b).powi(2) + moved;
+                let variance = 2.0 * reduced.noise(b).powi(2) + error(b).powi(2) + moved;
                 form.add(&k, last - initial, 1.0 / variance);
             }
             form

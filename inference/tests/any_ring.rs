@@ -28,7 +28,7 @@ fn booster(edit: impl FnOnce(&mut Value)) -> Ring {
 
 /// The paper's campaign without some columns, read for a ring; frames in which `corrector` is set are left out.
 fn without(ring: &Ring, columns: &[&str], corrector: Option<&str>) -> Recording {
-    let folder = repository("recordings/paper-vars");
+    let folder = repository("recordings/former/paper-vars");
     let frames = std::fs::read_to_string(folder.join("frames.csv")).unwrap();
     let names: Vec<&str> = frames.lines().next().unwrap().split(',').collect();
     let set = names.iter().position(|name| *name == "corrector").unwrap();
@@ -149,13 +149,13 @@ fn a_booster_with_a_monitor_less_is_fitted() {
     let recording = without(&ring, &["x_D8_mm"], None);
     assert_eq!(recording.rows[0].reading.len(), 32);
     let (_, fit) = fit(&ring, &recording, TuneUse::LeftOut);
-    assert_right("a monitor less", &fit, &truth(&repository("recordings/paper-vars"), &ring));
+    assert_right("a monitor less", &fit, &truth(&repository("recordings/former/paper-vars"), &ring));
 }
 
 #[test]
 fn a_booster_with_a_monitor_more_is_fitted() {
     let ring = booster(|machine| machine["data"]["bpm_x"].as_array_mut().unwrap().push(json!("F6")));
-    let mut template = without(&Ring::booster(), &[], None);
+    let mut template = without(&Ring::paper_booster(), &[], None);
     let at = ring.horizontal_monitors() - 1;
     template.header.noise.insert(at, template.header.noise[0]);
     template.rows.iter_mut().for_each(|row| row.reading.insert(at, Some(0.0)));
@@ -186,7 +186,7 @@ fn a_booster_without_one_of_its_correctors_is_fitted() {
     assert_eq!(ring.correctors.len(), 47);
     let recording = without(&ring, &["ic_C4_A"], Some("C4"));
     let (_, fit) = fit(&ring, &recording, TuneUse::LeftOut);
-    assert_right("a corrector missing", &fit, &truth(&repository("recordings/paper-vars"), &ring));
+    assert_right("a corrector missing", &fit, &truth(&repository("recordings/former/paper-vars"), &ring));
 }
 
 /// One factor on all vertically focusing quadrupoles; the others one by one, on their supply as before.
@@ -227,7 +227,7 @@ fn the_posterior_of_family_factors_is_that_of_the_batch_fit() {
 
 #[test]
 fn without_a_kick_or_a_reading_the_result_is_the_prior_and_says_so() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let recording = without(&ring, &[], None);
     let still =
         |row: &&inference::recording::Row| row.rf_offset == 0.0 && row.correctors.iter().all(|(_, a)| *a == 0.0);

@@ -41,7 +41,7 @@ fn truth(ring: &Ring, name: &str) -> Vec<f64> {
 
 /// The built-in machine file: the deck's supply law, and nothing that follows from it.
 fn powered() -> Value {
-    serde_json::from_str(BUILT_IN[1].1).unwrap()
+    serde_json::from_str(BUILT_IN[0].1).unwrap()
 }
 
 fn parsed(machine: &Value) -> Result<Ring, String> {
@@ -50,7 +50,7 @@ fn parsed(machine: &Value) -> Result<Ring, String> {
 
 #[test]
 fn tunes_and_strengths_follow_from_the_published_read_backs() {
-    let ring = Ring::built_in("booster-deck.json").unwrap();
+    let ring = Ring::booster();
     let tunes = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap();
     assert!((tunes.x - 4.8313).abs() < 2e-4 && (tunes.y - 4.6669).abs() < 2e-4, "{tunes:?}");
     let Some(deck) = deck() else { return };
@@ -69,7 +69,7 @@ fn what_the_file_states_beside_the_law_has_to_be_its_own() {
 
 /// The campaign of the repository: main current and trims as they are read.
 fn raw() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/deck/paper-vars")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars")
 }
 
 /// The header in format 2, without lines of these keys.
@@ -81,7 +81,7 @@ fn without(header: &str, keys: &[&str]) -> String {
 #[test]
 fn trims_and_effective_currents_give_one_answer() {
     let Some(folder) = shared("recordings/deck/paper-vars") else { return };
-    let ring = Ring::built_in("booster-deck.json").unwrap();
+    let ring = Ring::booster();
     let fits = [folder, raw()].map(|folder| {
         let recording = Recording::read(&folder, &ring).unwrap();
         let campaign = Campaign::of(&ring, &recording).unwrap();
@@ -98,7 +98,7 @@ fn trims_and_effective_currents_give_one_answer() {
 #[test]
 fn a_header_that_the_law_contradicts_is_refused_with_both_values() {
     let Some(folder) = shared("recordings/deck/paper-vars") else { return };
-    let ring = Ring::built_in("booster-deck.json").unwrap();
+    let ring = Ring::booster();
     let frames = std::fs::read_to_string(raw().join("frames.csv")).unwrap();
     let header = std::fs::read_to_string(folder.join("header.toml")).unwrap();
     let refused = |header: &str| Recording::parse(&folder, &ring, header, &frames).unwrap_err().to_string();

@@ -131,7 +131,7 @@ fn normal(random: &mut StdRng) -> f64 {
 
 impl Built {
     fn of(truth: &Truth, hardware: &Hardware, random: &mut StdRng) -> Self {
-        let mut ring = Ring::booster().with_vars(&truth.vars);
+        let mut ring = Ring::paper_booster().with_vars(&truth.vars);
         for quadrupole in &ring.quadrupoles {
             let place = &mut ring.elements[quadrupole.element].misalignment;
             (place.dx, place.dy) =
@@ -162,8 +162,8 @@ fn campaign(truth: &Truth) -> Recording {
 
 /// The first cycles of it.
 fn cycles(truth: &Truth, count: usize) -> Recording {
-    let template = Recording::read(&repository("recordings/paper-vars"), &Ring::booster()).unwrap();
-    let hardware = Hardware::shipped(&Ring::booster(), &template);
+    let template = Recording::read(&repository("recordings/former/paper-vars"), &Ring::paper_booster()).unwrap();
+    let hardware = Hardware::shipped(&Ring::paper_booster(), &template);
     let mut streams = simulate::seeds(truth.seed).map(StdRng::seed_from_u64);
     let [mut machine, mut ripple, mut noise] = core::array::from_fn(|_| streams.next().unwrap());
     let built = Built::of(truth, &hardware, &mut machine);
@@ -334,7 +334,7 @@ fn as_at_one_time(mut recording: Recording) -> Recording {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn one_baseline_for_all_times_would_not_do() {
-    let (plain, ring) = (Ring::booster(), with_ramp());
+    let (plain, ring) = (Ring::paper_booster(), with_ramp());
     for (apart, one_will_do) in [(0.0, true), (3e-4, false)] {
         let truth = Truth { apart, off: 0.0, ..Truth::of(&ring, 12) };
         let mut recording = campaign(&truth);
@@ -400,7 +400,7 @@ fn a_frame_outside_the_ramp_is_refused_with_its_time() {
 
 #[test]
 fn a_machine_file_without_the_ramp_is_said() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let recording = through_files(&one_cycle(), &ring).unwrap();
     let mut core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     let refused = stream::replay(&mut core, &recording, |_, _| ()).unwrap_err().to_string();

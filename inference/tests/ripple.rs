@@ -14,8 +14,8 @@ const MACHINES: [(u64, f64); 4] = [(119, 4.8685), (95, 4.8738), (240, 4.8635), (
 
 /// The campaign of a machine, and its vars.
 fn campaign(seed: u64, tune: f64) -> (Campaign, Vec<f64>) {
-    let ring = Ring::booster();
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+    let ring = Ring::paper_booster();
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/former/paper-vars");
     let template = Recording::read(&folder, &ring).unwrap();
     let vars = simulate::vars(&ring, true, seed).unwrap();
     let of_machine = Optics::of(&ring.with_vars(&vars), Hold::Momentum { delta: 0.0 }).unwrap().tunes().unwrap();

@@ -16,7 +16,7 @@ fn folders() -> Vec<PathBuf> {
         let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
         entries.filter(|path| path.join("frames.csv").exists()).collect()
     };
-    let mut all = [below(&root), below(&root.join("concealed"))].concat();
+    let mut all = [&root, &root.join("former"), &root.join("concealed")].map(|folder| below(folder)).concat();
     all.sort();
     all
 }
@@ -69,9 +69,9 @@ const NOISE: f32 = 0.05;
 
 #[test]
 fn readings_and_states_are_those_of_the_core() {
-    let ring = Ring::booster();
-    let names = ring.monitor_names();
     for folder in folders() {
+        let ring = Recording::lattice(&folder).and_then(|lattice| Ring::built_in(&lattice)).unwrap();
+        let names = ring.monitor_names();
         let recording = Recording::read(&folder, &ring).unwrap();
 
         let started = std::time::Instant::now();
@@ -106,8 +106,8 @@ fn readings_and_states_are_those_of_the_core() {
 /// counts, and the jumps do not.
 #[test]
 fn two_jumps_that_agree_do_not_outvote_the_readings_before_them() {
-    let ring = Ring::booster();
-    let mut recording = read(&ring, "paper-vars");
+    let ring = Ring::paper_booster();
+    let mut recording = read(&ring, "former/paper-vars");
     let b = ring.monitor_names().iter().position(|name| name == "y_C1").unwrap();
     // four repeats of a setting, in the middle of the campaign
     let first =
@@ -128,8 +128,8 @@ fn two_jumps_that_agree_do_not_outvote_the_readings_before_them() {
 /// is, of 31.
 #[test]
 fn a_machine_that_has_changed_is_hardly_any_monitors_fault() {
-    let ring = Ring::booster();
-    let [before, mut after] = ["paper-vars", "random-vars"].map(|name| read(&ring, name));
+    let ring = Ring::paper_booster();
+    let [before, mut after] = ["former/paper-vars", "former/random-vars"].map(|name| read(&ring, name));
     let last = before.rows.last().unwrap();
     for row in &mut after.rows {
         (row.sequence, row.time) = (row.sequence + last.sequence + 1, row.time + last.time + 4.0);
@@ -149,8 +149,8 @@ fn a_machine_that_has_changed_is_hardly_any_monitors_fault() {
 /// Two exchanged monitors draw the vars towards the half-integer, where the last step of the screening leads to no stable ring.
 #[test]
 fn a_screening_ends_at_a_stable_ring() {
-    let ring = Ring::booster();
-    let template = read(&ring, "paper-vars");
+    let ring = Ring::paper_booster();
+    let template = read(&ring, "former/paper-vars");
     let hardware = Hardware::shipped(&ring, &template);
     let effects = [Effect::parse("bpm_swap@y_A1,y_A7", &ring).unwrap()];
     for seed in [4, 13, 26] {
@@ -165,7 +165,7 @@ fn a_screening_ends_at_a_stable_ring() {
 
 /// A simulated campaign that takes each setting once, and how far each of its readings jumps [m]; with one effect or none.
 fn each_setting_once(ring: &Ring, effect: Option<&str>, seed: u64) -> (Recording, DMatrix<f64>) {
-    let mut template = read(ring, "paper-vars");
+    let mut template = read(ring, "former/paper-vars");
     let mut known = BTreeSet::new();
     template.rows.retain(|row| known.insert(format!("{:?} {}", row.correctors, row.rf_offset)));
     let jumping = Hardware::shipped(ring, &template);
@@ -190,7 +190,7 @@ const BEYOND_NOISE: f64 = 3e-3;
 /// two exchanged monitors, a reversed monitor, nothing. Of the readings that do not jump one in 300 is put aside at most.
 #[test]
 fn what_contradicts_the_model_counts_without_a_repeat() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let effects = ["corrector_polarity@H_D4", "corrector_gain@V_B5=0.12", "bpm_swap@y_A1,y_A7", "bpm_polarity@x_D6"];
     for effect in effects.into_iter().map(Some).chain([None]) {
         let (recording, jump) = each_setting_once(&ring, effect, 5);
@@ -214,7 +214,7 @@ fn what_contradicts_the_model_counts_without_a_repeat() {
 /// A cycle without a beam, in which every monitor reads its own noise, is put aside; nothing repeats it.
 #[test]
 fn a_lost_beam_is_put_aside_without_a_repeat() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let (mut recording, _) = each_setting_once(&ring, None, 6);
     let lost = [20, 51, 80];
     for (n, frame) in lost.into_iter().enumerate() {

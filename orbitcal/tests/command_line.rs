@@ -146,7 +146,7 @@ fn an_interrupted_replay_leaves_nothing_behind() {
         &json,
     ];
     let replay = command(&arguments).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
-    assert_eq!(lines.next().as_deref(), Some("from night shift: AGS Booster (BNL), design model"));
+    assert_eq!(lines.next().as_deref(), Some("from night shift: AGS Booster (BNL), deck"));
     assert_eq!(files(folder.path()).len(), 1, "the trace in the making");
     let interrupt = Command::new("kill").args(["-INT", &replay.id().to_string()]).status().unwrap();
     assert!(interrupt.success());

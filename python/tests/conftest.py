@@ -24,12 +24,13 @@ IMPORTS = RECORDINGS / "measured/imports"
 
 @pytest.fixture(scope="session")
 def booster():
-    return orbitcal.Ring.booster()
+    """As its published inference describes it."""
+    return orbitcal.Ring(ROOT / "machines/booster.json")
 
 
 @pytest.fixture(scope="session")
 def paper_vars(booster):
-    return orbitcal.Recording.read(RECORDINGS / "paper-vars", booster)
+    return orbitcal.Recording.read(RECORDINGS / "former/paper-vars", booster)
 
 
 @pytest.fixture(scope="session")

@@ -106,7 +106,7 @@ def test_another_process_is_read_from_shared_memory(last):
     command = [
         os.environ["ORBITCAL"],
         "replay",
-        RECORDINGS / "paper-vars",
+        RECORDINGS / "former/paper-vars",
         "--service",
         service,
         "--name",

@@ -13,7 +13,7 @@ import orbitcal
 
 def test_frames_and_header_are_those_of_the_files(paper_vars):
     frames = paper_vars.frames
-    known = pd.read_csv(RECORDINGS / "paper-vars/frames.csv")
+    known = pd.read_csv(RECORDINGS / "former/paper-vars/frames.csv")
     assert len(paper_vars) == len(frames) == len(known) == 346
     np.testing.assert_allclose(frames["x_E4_mm"], known["x_E4_mm"], rtol=0, atol=1e-12)  # mm to m and back
     assert paper_vars.header["believed_rf"] == "fixed_momentum" and paper_vars.header["format"] == 2

@@ -15,7 +15,6 @@ import orbitcal
 
 def test_a_fit_is_that_of_the_program(fitted):
     assert (fitted.method, fitted.model, fitted.frames) == ("map", "twin", 346)
-    # the README's table is the stream's, which is within 0.1 of an error bar (0.3 to 0.5 %) of this
     assert abs(fitted.means["D8"] - 0.9567) < 4e-4 and abs(fitted.means["A4"] - 0.9916) < 4e-4
     assert abs(fitted.chi2_per_dof - 0.987) < 2e-3 and fitted.tunes == pytest.approx((4.8061, 4.6534), abs=1e-4)
     assert {one.name: one.state for one in fitted.monitors}["x_C6"] == "noisy"
@@ -23,6 +22,14 @@ def test_a_fit_is_that_of_the_program(fitted):
     assert covariance.shape == (48, 48)
     # sigma is that of the truncated posterior
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), fitted.table["sigma"], rtol=0.05)
+
+
+def test_a_recording_is_read_with_the_built_in_ring_that_it_names():
+    recording = orbitcal.Recording.read(RECORDINGS / "paper-vars")
+    assert recording.ring.optics().attrs["tune_x"] == orbitcal.Ring.booster().optics().attrs["tune_x"]
+    fitted = orbitcal.fit(recording)
+    # the README's table is the stream's, which is within 0.1 of an error bar (0.3 to 0.5 %) of this
+    assert fitted.tunes == pytest.approx((4.8076, 4.6553), abs=1e-4) and abs(fitted.means["D8"] - 0.9582) < 4e-4
 
 
 def test_a_result_prints_shows_and_reports(fitted, tmp_path):
@@ -81,7 +88,7 @@ def test_missing_physics_is_found(diagnosed, tmp_path):
 
 
 def test_what_changed_between_two_recordings(paper_vars, booster):
-    other = orbitcal.Recording.read(RECORDINGS / "random-vars", booster)
+    other = orbitcal.Recording.read(RECORDINGS / "former/random-vars", booster)
     compared = orbitcal.compare(paper_vars, other)
     assert len(compared.changes) == 48 and compared.sentence
     assert compared.table["changed"].any() and "data:image/png" in compared._repr_html_()

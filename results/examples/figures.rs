@@ -18,7 +18,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("usage: figures RECORDING FOLDER [SECTION...]".into());
     };
     let wanted: Vec<String> = arguments.collect();
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let recording = Recording::read(Path::new(&recording), &ring)?;
     let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ())?;
     let page = diagnosis_page(&diagnosis, &recording)?;

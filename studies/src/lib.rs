@@ -165,12 +165,14 @@ pub fn run(
 ) -> Result<Study, StudyError> {
     let mut sampling = Sampling::new(ring, recording, options.nuts, progress)?;
     let drawn = subsets::drawn(sampling.campaign());
+    let beside = if published::is_published(ring, recording) { published::DRAWN.to_vec() } else { Vec::new() };
     // all frames, the subsets, the priors, and the simulated readings
-    sampling.plan(1 + drawn.iter().map(|(_, times)| times).sum::<usize>() + prior::RUNS + 1);
+    let posteriors = drawn.iter().chain(&beside).map(|(_, times)| times).sum::<usize>();
+    sampling.plan(1 + posteriors + prior::RUNS + 1);
     let frames = Readings::of_frames(&sampling.reduced, &sampling.twin, TuneUse::LeftOut);
     let reference = sampling.sample("all frames", frames, None)?;
     let var = farthest(&reference);
-    let subsets = subsets::sample(&mut sampling, &drawn)?;
+    let subsets = subsets::sample(&mut sampling, &drawn, |_| 0.0)?;
     let (sensitivity, by_width) = prior::study(&mut sampling, &subsets)?;
     let single = single::study(&sampling, &subsets, &by_width, var);
     let correlations = correlations::study(&mut sampling, &reference, var)?;
@@ -178,9 +180,10 @@ pub fn run(
     let (approximations, laplace) = laplace::study(&sampling, &reference)?;
     let (trimming, faults) = trimming::study(&sampling)?;
     let names = sampling.names();
-    let published = if published::is_published(ring, recording) { published::beside(&subsets) } else { Vec::new() };
+    let beside = subsets::sample(&mut sampling, &beside, published::error(ring))?;
+    let published = published::beside(&beside);
     let stability = (!drawn.is_empty()).then(|| subsets.stability(&names));
-    let beside = (!published.is_empty()).then(|| published::section(&subsets, &published));
+    let beside = (!published.is_empty()).then(|| published::section(&beside, &published));
     let first = [Some(subsets::final_table(&sampling, &subsets, &reference)), beside, Some(sensitivity), Some(single)];
     let then = [stability, Some(correlations), prediction, Some(approximations), Some(trimming)];
     let sections = first.into_iter().chain(then).flatten().chain([sampling::section(&sampling.runs)]).collect();

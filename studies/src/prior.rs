@@ -55,7 +55,7 @@ pub fn study(sampling: &mut Sampling, subsets: &Subsets) -> Result<(Section, ByW
 
 fn readings(sampling: &Sampling, subsets: &Subsets) -> Readings {
     match subsets.first() {
-        Some((subset, _)) => Readings::of_pairs(&sampling.reduced, &sampling.twin, &subset.pairs),
+        Some((subset, _)) => Readings::of_pairs(&sampling.reduced, |_| 0.0, &subset.pairs),
         None => Readings::of_frames(&sampling.reduced, &sampling.twin, inference::TuneUse::LeftOut),
     }
 }

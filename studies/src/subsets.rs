@@ -78,11 +78,15 @@ pub fn drawn(campaign: &Campaign) -> Vec<(Kind, usize)> {
     DRAWN.into_iter().filter(|(kind, _)| !Subset::draw(campaign, *kind, 0).pairs.is_empty()).collect()
 }
 
-/// Sample every subset of some kinds, each this often.
+/// Sample every subset of some kinds, each this often, by a model whose error in a difference is `error`, by monitor [m].
 ///
 /// # Errors
 /// [`StudyError`].
-pub fn sample(sampling: &mut Sampling, drawn: &[(Kind, usize)]) -> Result<Subsets, StudyError> {
+pub fn sample(
+    sampling: &mut Sampling,
+    drawn: &[(Kind, usize)],
+    error: impl Fn(usize) -> f64,
+) -> Result<Subsets, StudyError> {
     let campaign = sampling.campaign();
     let settings = Settings::of(&campaign.recording, campaign.ring.correctors.len());
     let mut all = Vec::new();
@@ -90,7 +94,7 @@ pub fn sample(sampling: &mut Sampling, drawn: &[(Kind, usize)]) -> Result<Subset
         for i in 1..=*times {
             let seed = sampling.seed();
             let subset = Subset::draw(sampling.campaign(), *kind, seed);
-            let readings = Readings::of_pairs(&sampling.reduced, &sampling.twin, &subset.pairs);
+            let readings = Readings::of_pairs(&sampling.reduced, &error, &subset.pairs);
             let name = format!("{}, subset {i}", settings.words(*kind));
             let sampled = sampling.sample(&name, readings, None)?;
             all.push((subset, sampled));

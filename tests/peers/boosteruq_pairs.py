@@ -1,6 +1,6 @@
 """Differences of frame pairs for BoosterUQ, and what orbitcal's twin makes of the same numbers.
 
-    python tests/peers/boosteruq_pairs.py recordings/deck/paper-vars target/boosteruq   (numpy; the program built)
+    python tests/peers/boosteruq_pairs.py recordings/paper-vars target/boosteruq   (numpy; the program built)
     julia tests/peers/boosteruq.jl PATH/TO/BoosterUQ target/boosteruq/pairs.csv       (the environment of BoosterUQ)
 
 BoosterUQ compares orbits with readings; a recording has monitor offsets and a closed orbit that nobody knows. So each corrector gives one pair of

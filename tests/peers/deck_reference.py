@@ -91,7 +91,7 @@ def by_madx(elements, momentum, circumference):
 def main():
     machine = json.loads((ROOT / "machines/booster-deck.json").read_text())
     elements, momentum = powered(machine)
-    vars_of = {"design": {}, "paper": json.loads((ROOT / "recordings/deck/paper-vars/truth.json").read_text())["vars"]}
+    vars_of = {"design": {}, "paper": json.loads((ROOT / "recordings/paper-vars/truth.json").read_text())["vars"]}
     result = {}
     for word, make in [("pyat", by_pyat), ("madx", by_madx)]:
         for machine_word, factors in vars_of.items():

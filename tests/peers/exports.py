@@ -50,7 +50,7 @@ class Case:
         found = [dict(kind=k, at=p, amplitude=a, probability=1.0, sentence=f"{k} at {p}") for k, p, a in self.findings]
         self.result.write_text(json.dumps(dict(recording=name, vars=strengths, findings=found)))
         self.vars.write_text(json.dumps({var["name"]: var["mean"] for var in strengths}))
-        elements = json.loads((machine or ROOT / "machines/booster.json").read_text())["elements"]
+        elements = json.loads((machine or ROOT / "machines/booster-deck.json").read_text())["elements"]
         self.monitors = channels(elements, "bpm")
         self.correctors = channels(elements, "corrector")
 
@@ -181,8 +181,8 @@ def drift(name, length):
     return at.Drift(name, length, PassMethod="ExactDriftPass")
 
 
-def dipole(name, length, angle, k1, e1, e2, fint, hgap):
-    return at.Dipole(name, length, angle, PolynomB=[0.0, k1], EntranceAngle=e1, ExitAngle=e2, FringeInt1=fint,
+def dipole(name, length, angle, k1, k2, e1, e2, fint, hgap):
+    return at.Dipole(name, length, angle, PolynomB=[0.0, k1, k2 / 2], EntranceAngle=e1, ExitAngle=e2, FringeInt1=fint,
                      FringeInt2=fint, FullGap=2 * hgap, gK=2 * fint * hgap, NumIntSteps=20, PassMethod="ExactSectorBendPass")
 
 
@@ -231,7 +231,7 @@ def pals_element(e):
         case "SBend":
             bend = e.BendP
             assert bend.edge_int1 == bend.edge_int2
-            return aligned(dipole(e.name, e.length, bend.g_ref * e.length, k(1), bend.e1, bend.e2, 0.5,
+            return aligned(dipole(e.name, e.length, bend.g_ref * e.length, k(1), k(2), bend.e1, bend.e2, 0.5,
                                   2 * bend.edge_int1), roll=bend.tilt_ref, **align)
     raise ValueError(e.kind)
 
@@ -244,7 +244,7 @@ BMAD = {
     "sextupole": {"l", "k2", "tilt", "x_offset", "y_offset"},
     "solenoid": {"l", "ks", "tilt", "x_offset", "y_offset"},
     "ab_multipole": {"b1", "a1", "b2", "b3", "tilt", "x_offset", "y_offset"},
-    "sbend": {"l", "g", "k1", "e1", "e2", "fint", "hgap", "ref_tilt", "x_offset", "y_offset"},
+    "sbend": {"l", "g", "k1", "k2", "e1", "e2", "fint", "hgap", "ref_tilt", "x_offset", "y_offset"},
 }
 NAME = r"[A-Za-z][A-Za-z0-9_.]{0,39}"
 
@@ -306,7 +306,8 @@ def bmad_element(name, kind, a):
         case "ab_multipole":
             return aligned(at.ThinMultipole(name, [0, g("a1"), 0, 0], [0, g("b1"), g("b2"), g("b3")]), **align)
         case "sbend":
-            return aligned(dipole(name, g("l"), g("g") * g("l"), g("k1"), g("e1"), g("e2"), g("fint"), g("hgap")), **align)
+            return aligned(dipole(name, g("l"), g("g") * g("l"), g("k1"), g("k2"), g("e1"), g("e2"), g("fint"), g("hgap")),
+                           **align)
     raise ValueError(kind)
 
 

@@ -14,11 +14,23 @@ pub mod surrogates;
 
 use std::path::{Path, PathBuf};
 
+use inference::Recording;
 use twin::Ring;
 
 /// A file or folder of the repository.
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
+}
+
+/// A recording that ships with the repository, and the built-in machine that it is of.
+///
+/// # Panics
+/// If it cannot be read.
+pub fn recording(name: &str) -> (Ring, Recording) {
+    let folder = repository("recordings").join(name);
+    let ring = Recording::lattice(&folder).and_then(|lattice| Ring::built_in(&lattice)).expect("of a built-in machine");
+    let recording = Recording::read(&folder, &ring).expect("a recording of the repository");
+    (ring, recording)
 }
 
 /// True vars of a recording, in the order of the ring's quadrupoles [N].

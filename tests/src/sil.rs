@@ -139,8 +139,10 @@ pub fn bits(e: &Estimate) -> Vec<u64> {
     numbers.into_iter().chain(remarks).chain(masks).chain(rest).chain(floats).chain(health).collect()
 }
 
-/// Most instructions of each region in a run, in the order of [`REGIONS`].
+/// Most instructions of each region in the second half of a run, in the order of [`REGIONS`]: by then it is known where the correctors stand, and no var is at
+/// a bound.
 pub fn largest(counts: &Counts) -> Vec<(&'static str, u64)> {
-    let most = |name: &str| counts.get(name).and_then(|runs| runs.iter().max()).copied().unwrap_or(0);
+    let half = |name: &str| counts.get(name).map(|runs| &runs[runs.len() / 2..]);
+    let most = |name: &str| half(name).and_then(|runs| runs.iter().max()).copied().unwrap_or(0);
     REGIONS.iter().map(|(word, name)| (*word, most(name))).collect()
 }

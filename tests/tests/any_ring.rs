@@ -111,7 +111,7 @@ fn an_effect_is_named_where_not_every_quadrupole_is_fitted() {
     std::fs::write(&file, not_fitted.to_string()).unwrap();
     let ring = Ring::read(&file).unwrap();
     assert_eq!(ring.parameters.len(), 47);
-    let template = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
+    let template = Recording::read(&repository("recordings/former/paper-vars"), &ring).unwrap();
     let vars = simulate::vars(&ring, true, 3).unwrap();
     let effects = [Effect::parse("quad_roll@D8=0.012", &ring).unwrap()];
     let truth = simulate::Truth { vars: &vars, effects: &effects, beyond: &[] };

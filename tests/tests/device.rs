@@ -120,8 +120,8 @@ fn heard(bytes: &[u8]) -> Vec<Option<u8>> {
 }
 
 fn paper_vars() -> (Ring, Recording) {
-    let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings/paper-vars"), &ring).unwrap();
+    let ring = Ring::paper_booster();
+    let recording = Recording::read(&repository("recordings/former/paper-vars"), &ring).unwrap();
     (ring, recording)
 }
 

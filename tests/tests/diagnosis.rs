@@ -8,21 +8,17 @@ use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
 use inference::{Campaign, Imperfection, Measure, Recording};
 use nalgebra::DVector;
-use system_tests::repository;
+use system_tests::{recording, repository};
 use twin::{Effect, EffectKind, Machine, Measured, Rf, Ring};
 use validation::{Cases, Class, Grade, Truth, Unmodelled, UnmodelledKind};
 
-fn read(name: &str) -> Recording {
-    Recording::read(&repository("recordings").join(name), &Ring::booster()).unwrap()
-}
-
-fn whitened(recording: &Recording) -> Data {
-    Data::from_campaign(&Campaign::of(&Ring::booster(), recording).unwrap()).unwrap()
+fn whitened((ring, recording): &(Ring, Recording)) -> Data {
+    Data::from_campaign(&Campaign::of(ring, recording).unwrap()).unwrap()
 }
 
 /// A blind campaign; none if its machine keeps no beam.
 fn tracked(effects: &[Effect], seed: u64) -> Option<Recording> {
-    let (ring, template) = (Ring::booster(), read("paper-vars"));
+    let (ring, template) = recording("paper-vars");
     let vars = simulate::vars(&ring, true, seed).unwrap();
     let truth = simulate::Truth { vars: &vars, effects, beyond: &[] };
     simulate::campaign(&template, &ring, &truth, &Hardware::shipped(&ring, &template), seed).ok()
@@ -37,11 +33,11 @@ fn simulated(effects: &[Effect], seed: u64) -> Recording {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn concealed_effects_are_found_and_only_those() {
-    let ring = Ring::booster();
     let (mut chi_square, mut amplitudes) = (0.0, 0.0);
     for i in 0..12 {
         let name = format!("concealed/open-{i:02}");
-        let diagnosis = Diagnosis::from_recording(&ring, &read(&name), |_| ()).unwrap();
+        let (ring, recording) = recording(&name);
+        let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         let truth = Truth::read(&repository("recordings").join(&name), &ring).unwrap();
         let grade = truth.grade(&diagnosis);
         match i {
@@ -69,7 +65,7 @@ fn concealed_effects_are_found_and_only_those() {
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn every_kind_is_found_when_it_is_strong() {
     let ring = Ring::booster();
-    let data = whitened(&simulated(&[], 5));
+    let data = whitened(&(Ring::booster(), simulated(&[], 5)));
     // beside what is ordinary
     let null = Fitted::from_guess(&data, &Hypothesis::plain(), &DVector::zeros(48)).unwrap();
     let loop_on = ["x_D8".to_owned(), "x_E6".to_owned()];
@@ -149,8 +145,7 @@ fn gross_faults_are_named_at_their_size() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn a_reversed_corrector_is_named_where_no_setting_is_repeated() {
-    let ring = Ring::booster();
-    let mut recording = read("concealed/open-07");
+    let (ring, mut recording) = recording("concealed/open-07");
     let mut known = BTreeSet::new();
     recording.rows.retain(|row| known.insert(format!("{:?} {}", row.correctors, row.rf_offset)));
     assert_eq!(recording.rows.len(), 110);
@@ -267,7 +262,7 @@ fn what_all_correctors_or_all_dipoles_have_is_ordinary() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn unmodelled_physics_is_not_named() {
-    let (ring, template) = (Ring::booster(), read("paper-vars"));
+    let (ring, template) = recording("paper-vars");
     let hardware = Hardware::shipped(&ring, &template);
     let vars = simulate::vars(&ring, true, 3).unwrap();
     use UnmodelledKind::{OrbitDrift, QuadJump, Saturation};
@@ -296,7 +291,7 @@ fn unmodelled_physics_is_not_named() {
 /// A seed draws the same cases whatever was drawn before.
 #[test]
 fn cases_are_fixed_by_their_number() {
-    let (ring, template) = (Ring::booster(), read("paper-vars"));
+    let (ring, template) = recording("paper-vars");
     let cases = Cases::of(&Campaign::of(&ring, &template).unwrap()).unwrap();
     let draw = |index| cases.draw(Class::Pair, index, 1);
     assert_eq!(draw(7).effects, draw(7).effects);
@@ -313,10 +308,10 @@ fn cases_are_fixed_by_their_number() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn the_amplitude_is_that_of_nuts() {
-    let ring = Ring::booster();
     for (name, kind, place) in [("open-04", EffectKind::QuadRoll, "F2"), ("open-08", EffectKind::BpmRoll, "y_C5")] {
-        let data = whitened(&read(&format!("concealed/{name}")));
-        let hypothesis = Hypothesis::default().with(Term::at(kind, place, &ring).unwrap());
+        let of_ring = recording(&format!("concealed/{name}"));
+        let (ring, data) = (&of_ring.0, whitened(&of_ring));
+        let hypothesis = Hypothesis::default().with(Term::at(kind, place, ring).unwrap());
         let fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(48)).unwrap();
         let (mean, sigma) = fitted.amplitude(&data, 0);
         let settings = NutsSettings { chains: 2, warm_up: 100, draws: 200, seed: 1 };
@@ -345,12 +340,12 @@ fn the_amplitude_is_that_of_nuts() {
 /// `diagnose` writes the tables of the machine that it found.
 #[test]
 fn the_extended_machine_is_that_of_the_findings() {
-    let ring = Ring::booster();
-    let hypothesis = Hypothesis::default().with(Term::at(EffectKind::BpmGain, "x_E6", &ring).unwrap());
-    let data = whitened(&read("concealed/open-02"));
+    let of_ring = recording("concealed/open-02");
+    let (ring, data) = (&of_ring.0, whitened(&of_ring));
+    let hypothesis = Hypothesis::default().with(Term::at(EffectKind::BpmGain, "x_E6", ring).unwrap());
     let (machine, _) = hypothesis.machine(&data, &[0.0; 48], &[-1.0]).unwrap();
     let strength = ring.strengths(&[0.0; 48], &data.supplies);
-    let gain = Effect::parse("bpm_gain@x_E6=-0.08", &ring).unwrap();
+    let gain = Effect::parse("bpm_gain@x_E6=-0.08", ring).unwrap();
     let direct = Machine::new(ring.with_strengths(&strength), Rf::FixedMomentum, &[gain]).unwrap();
     assert_eq!(machine.response().unwrap().x, direct.response().unwrap().x);
 }

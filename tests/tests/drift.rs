@@ -31,7 +31,7 @@ fn mean_nees(followed: &[Followed]) -> f64 {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a minute without optimisation")]
 fn the_drift_stream_is_followed() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let stream = Stream::committed(&ring).unwrap();
     let followed = drift::follow(&ring, &stream).unwrap();
     // what is asked for: at most 1 % of the frames outside 3 sigma, where normal errors give 0.27 %; NEES/48 of 0.6 to 1.6; error bars of 0.45 %
@@ -52,7 +52,7 @@ fn the_drift_stream_is_followed() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn steps_of_any_var_are_found_and_stay_within_the_bands() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     for seed in 1..=4 {
         let stream = Stream::simulated(&ring, seed, 1500, step(0.02)).unwrap();
         let followed = drift::follow(&ring, &stream).unwrap();
@@ -72,7 +72,7 @@ fn steps_of_any_var_are_found_and_stay_within_the_bands() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
 fn nothing_is_let_loose_where_nothing_steps() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     for seed in 11..=13 {
         let stream = Stream::simulated(&ring, seed, 1500, |_| Changes::default()).unwrap();
         let followed = drift::follow(&ring, &stream).unwrap();

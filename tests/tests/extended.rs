@@ -13,7 +13,7 @@ use twin::{Cycle, Effect, Machine, Rf, Ring, Tracked};
 
 /// The frames of `paper-vars`, with the exact orbits of a machine, each cycle by itself, baselines and 0.15 mm of noise.
 fn recorded(ring: &Ring, vars: &[f64], effects: &[Effect]) -> Recording {
-    let mut recording = Recording::read(&repository("recordings/paper-vars"), ring).unwrap();
+    let mut recording = Recording::read(&repository("recordings/former/paper-vars"), ring).unwrap();
     let machine = Machine::new(ring.clone(), Rf::FixedMomentum, effects).unwrap();
     let machine = Tracked::of(machine, recording.nominal_kick()).unwrap();
     let mut random = StdRng::seed_from_u64(1);
@@ -73,7 +73,7 @@ fn both(ring: &Ring, recording: &Recording, truth: &[f64], effects: &[Effect]) -
 
 #[test]
 fn a_model_with_the_missing_physics_describes_the_machine() {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let vars = simulate::vars(&with_priors(&ring, Some(0.02), None), true, 3).unwrap();
     for effect in ["quad_roll@F2=-0.018", "fixed_rf_frequency", "bpm_gain@x_E6=-0.076", "stray_gradient@SLOT_A3=-0.026"]
     {

@@ -12,14 +12,8 @@ use inference::{
 };
 use nalgebra::DMatrix;
 use studies::{self, Kind, Options, Sampled, Subset};
-use system_tests::repository;
+use system_tests::recording;
 use twin::Ring;
-
-fn read(name: &str) -> (Ring, Recording) {
-    let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings").join(name), &ring).unwrap();
-    (ring, recording)
-}
 
 fn reduced(ring: &Ring, recording: &Recording) -> Reduced {
     let campaign = Campaign::of(ring, recording).unwrap();
@@ -42,12 +36,12 @@ fn sample(reduced: &Reduced, posterior: Posterior, settings: NutsSettings) -> Nu
 /// third of an error bar from the MAP.
 #[test]
 fn the_gradient_is_that_of_the_density() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let reduced = reduced(&ring, &recording);
     let pairs = Subset::draw(&reduced.campaign, Kind::MinusToPlus, 1).pairs;
     for model in [ResponseModel::twin(&ring).unwrap(), ResponseModel::green(&ring).unwrap()] {
         let frames = Readings::of_frames(&reduced, &model, TuneUse::Readings);
-        let modes = [frames, Readings::of_pairs(&reduced, &model, &pairs)];
+        let modes = [frames, Readings::of_pairs(&reduced, |b| model.stated_error(b), &pairs)];
         for (readings, width) in modes.into_iter().zip([Width::Lognormal(0.03), Width::Loguniform]) {
             let posterior = Posterior::new(model.clone(), readings, Prior::of_width(&ring, width));
             let laplace = posterior.laplace(&reduced.fit.map_params).unwrap();
@@ -76,7 +70,7 @@ fn the_gradient_is_that_of_the_density() {
 #[test]
 fn the_reduced_density_has_the_batch_fits_maximum() {
     for name in ["paper-vars", "random-vars"] {
-        let (ring, recording) = read(name);
+        let (ring, recording) = recording(name);
         let reduced = reduced(&ring, &recording);
         let (posterior, fit) = (posterior(&reduced, ResponseModel::twin(&ring).unwrap()), &reduced.fit);
         let (value, gradient) = posterior.of_params(&fit.map_params).unwrap();
@@ -91,7 +85,7 @@ fn the_reduced_density_has_the_batch_fits_maximum() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a minute unoptimised; the release tests run it")]
 fn the_core_is_the_posterior_that_nuts_finds() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let reduced = reduced(&ring, &recording);
     let run = sample(&reduced, posterior(&reduced, ResponseModel::twin(&ring).unwrap()), NutsSettings::default());
     let reference = Sampled::of(&run.draws);
@@ -137,7 +131,7 @@ fn assert_covered(what: &str, nominal: f64, inside: &[f64]) {
 
 /// Simulated campaigns with vars from the truncated prior, their ring within the tune cut or not.
 fn simulated(count: usize, tune_cut: bool, seed: u64) -> impl Iterator<Item = (Ring, Recording, Vec<f64>)> {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let instruments = Instruments::healthy(&ring, &recording).unwrap();
     simulate::seeds(seed).take(count).map(move |seed| {
         let vars = simulate::vars(&ring, tune_cut, seed).unwrap();
@@ -149,7 +143,7 @@ fn simulated(count: usize, tune_cut: bool, seed: u64) -> impl Iterator<Item = (R
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes unoptimised; the release tests run it")]
 fn error_bars_of_the_core_cover_a_hundred_simulated_truths() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let fresh: Core = stream::estimator(&ring, &recording, Walk::NONE).unwrap();
     for tune_cut in [false, true] {
         let mut inside = [Vec::new(), Vec::new()];
@@ -197,7 +191,7 @@ fn error_bars_of_nuts_cover_ten_simulated_truths() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "minutes unoptimised; the release tests run it")]
 fn the_studies_make_a_report_and_find_d8_below_unity() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let nuts = NutsSettings { chains: 2, warm_up: 200, draws: 300, seed: 3 };
     let made = studies::run(&ring, &recording, Options { nuts }, &mut |_, _, _| ()).unwrap();
     let d8 = ring.var_names().iter().position(|name| name == "D8").unwrap();

@@ -189,7 +189,7 @@ fn a_better_model_weighs_the_settings_so_far() {
         running.steer();
         running.cycles(200);
         let (before, _) = running.nees();
-        assert!(before > 3.0, "the first model would do: NEES/48 {before:.2}");
+        assert!(before > HONEST.end, "the first model would do: NEES/48 {before:.2}");
         running.adopt(&effects);
         running.cycles(50);
         assert!(running.assert_honest("with the better model") < 5e-3);

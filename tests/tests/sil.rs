@@ -18,20 +18,14 @@ use system_tests::endurance::endure;
 use system_tests::feedback::{Chip, Control, Known, Loop, REGIONS, Scenario, recommended};
 use system_tests::machine::LAYOUT;
 use system_tests::qemu::{Emulator, Image, Options};
-use system_tests::repository;
 use system_tests::sil::{bits, compare, largest};
+use system_tests::{recording, repository};
 use training::LINE;
 use training::rooms::largest::{PACKET, Reply, Request};
 use twin::{Effect, Ring};
 
 /// Built once for all tests.
 static IMAGE: LazyLock<Image> = LazyLock::new(|| Image::build().unwrap_or_else(|error| panic!("{error}")));
-
-fn read(name: &str) -> (Ring, Recording) {
-    let ring = Ring::booster();
-    let recording = Recording::read(&repository("recordings").join(name), &ring).unwrap();
-    (ring, recording)
-}
 
 fn wires(recording: &Recording) -> Vec<Vec<u8>> {
     recording.rows.iter().map(|row| stream::wire(recording, row).unwrap()).collect()
@@ -81,7 +75,7 @@ fn check_instructions(counts: &[(&'static str, u64)]) {
 
 #[test]
 fn the_chip_answers_a_campaign_as_the_host_does() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let run = compare(&IMAGE, (&ring, &recording), Walk::NONE, true, |_| Ok(())).unwrap();
     assert_eq!((run.frames, run.different.as_slice()), (346, [].as_slice()));
     assert!(run.interrupting > 0, "no frame came between two slices");
@@ -90,20 +84,22 @@ fn the_chip_answers_a_campaign_as_the_host_does() {
     let counts = largest(&run.counts);
     let of = |step: &str| counts.iter().find(|(name, _)| *name == step).unwrap().1;
     assert!(of("ingest") + of("encode") <= 1_000_000, "{} + {}", of("ingest"), of("encode"));
-    assert!(of("slice") <= 1_500_000, "{}", of("slice"));
+    // frames of no setting, here those before it is known where the correctors stand, count in two sums, and their MAP may be at bounds
+    let most = ["Estimator::ingest", "Estimator::prepare"].map(|name| run.counts[name].iter().max().unwrap());
+    assert!(*most[0] <= 2_000_000 && *most[1] <= 1_500_000, "{most:?}");
     check_instructions(&counts);
 }
 
 #[test]
-fn the_chip_answers_a_drifting_machine_as_the_host_does() {
-    let (ring, mut recording) = read("drift-stream");
-    recording.rows.truncate(500);
-    for process_noise in [0.0, 2e-4] {
-        let walk = stream::walk_per_cycle(&recording, process_noise, 0.0);
-        let run = compare(&IMAGE, (&ring, &recording), walk, false, |_| Ok(())).unwrap();
-        assert_eq!((run.frames, run.different.as_slice()), (500, [].as_slice()), "walk {process_noise}");
-        assert_eq!(run.status.vitals.lost_bytes, 0);
+fn the_chip_answers_as_the_host_does_while_params_walk_and_monitors_drop_out() {
+    let (ring, mut recording) = recording("random-vars");
+    for row in &mut recording.rows[100..200] {
+        (row.reading[3], row.reading[20]) = (None, None);
     }
+    let walk = stream::walk_per_cycle(&recording, 2e-4, 0.0);
+    let run = compare(&IMAGE, (&ring, &recording), walk, false, |_| Ok(())).unwrap();
+    assert_eq!((run.frames, run.different.as_slice()), (346, [].as_slice()));
+    assert_eq!(run.status.vitals.lost_bytes, 0);
 }
 
 /// A device on the emulated chip, and the core in process that hears the same good frames.
@@ -145,7 +141,7 @@ impl<'e> Pair<'e> {
 
 #[test]
 fn faults_on_the_wire_are_counted_and_change_nothing() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let good = wires(&recording);
     let emulator = start();
     let mut pair = Pair::start(&emulator, &ring, &recording);
@@ -195,7 +191,7 @@ fn faults_on_the_wire_are_counted_and_change_nothing() {
 /// Longer than the watchdog of a board waits: the emulator stands still, its timers do not.
 #[test]
 fn a_host_that_stands_still_changes_nothing() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let good = wires(&recording);
     let emulator = start();
     let mut pair = Pair::start(&emulator, &ring, &recording);
@@ -248,7 +244,7 @@ fn the_chip_steers_as_the_host_does() {
 /// sends in a cycle. The emulated UART has no rate: they are sent at once, just as the chip begins to linearise.
 #[test]
 fn frames_that_come_during_an_update_are_not_lost() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let good = wires(&recording);
     let emulator = start();
     let mut pair = Pair::start(&emulator, &ring, &recording);
@@ -276,7 +272,7 @@ fn frames_that_come_during_an_update_are_not_lost() {
 /// More than any device can take: what was answered is right, what was not is counted, and the device lives.
 #[test]
 fn a_storm_of_frames_is_survived() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let good = wires(&recording);
     let emulator = start();
     let mut pair = Pair::start(&emulator, &ring, &recording);
@@ -334,7 +330,7 @@ fn a_storm_of_frames_is_survived() {
 
 #[test]
 fn new_tables_reach_the_chip() {
-    let (ring, recording) = read("paper-vars");
+    let (ring, recording) = recording("paper-vars");
     let good = wires(&recording);
     let emulator = start();
     let mut pair = Pair::start(&emulator, &ring, &recording);
@@ -361,7 +357,7 @@ fn the_log_is_decoded_and_a_fault_reported() {
     let folder = tempfile::tempdir().unwrap();
     let image = IMAGE.patched(&step, &[0x00, 0xde], &folder.path().join("firmware")).unwrap();
     let emulator = Emulator::start(&image, &Options::default()).unwrap();
-    let (_, recording) = read("paper-vars");
+    let (_, recording) = recording("paper-vars");
     Link::new(emulator.uart()).write(&wires(&recording)[0]).unwrap();
     let run = emulator.wait(Duration::from_secs(120)).unwrap();
     let log = IMAGE.log(&run.stdout).unwrap();

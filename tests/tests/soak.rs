@@ -179,7 +179,7 @@ fn settings_that_are_retired_leave_a_chi_square_of_one_a_degree() {
 fn a_long_gap_is_a_long_walk() {
     let (walk, gap) = (5e-5, 30_000);
     for row in [Row::Several, Row::Single] {
-        let mut soak = Soak::new(row, 4, walk_per_cycle(walk)).unwrap();
+        let mut soak = Soak::new(row, 5, walk_per_cycle(walk)).unwrap();
         stream(&mut soak, 200);
         soak.skip(gap);
         soak.machine.walk(walk * (gap as f32).sqrt());

@@ -40,7 +40,7 @@ fn matrix(value: &Value) -> DMatrix<f64> {
 
 /// The four machines of a code: name, its numbers, and the ring with its vars.
 fn machines(code: &str) -> Vec<(String, Value, Ring)> {
-    let design = Ring::booster();
+    let design = Ring::paper_booster();
     let names = design.var_names();
     let of = |(name, reference): (&String, &Value)| {
         let vars: Vec<f64> = names.iter().map(|n| number(&reference["vars"][n])).collect();
@@ -208,7 +208,7 @@ fn effect(entry: &Value) -> Effect {
     let kind = entry["kind"].as_str().unwrap();
     let place = entry["at"].as_str().map_or(String::new(), |at| format!("@{at}"));
     let amplitude = entry["amplitude"].as_f64().map_or(String::new(), |a| format!("={a}"));
-    Effect::parse(&format!("{kind}{place}{amplitude}"), &Ring::booster()).unwrap()
+    Effect::parse(&format!("{kind}{place}{amplitude}"), &Ring::paper_booster()).unwrap()
 }
 
 /// The seven cases of a code, both planes, through the words of the command line; tolerance in x and y.
@@ -218,7 +218,7 @@ fn assert_cases_equal(code: &str, tolerance: impl Fn(&str) -> [f64; 2]) {
     assert_eq!(cases.len(), 7);
     for (name, reference) in cases {
         let effects: Vec<Effect> = reference["effects"].as_array().unwrap().iter().map(effect).collect();
-        let ours = Machine::new(Ring::booster(), twin::Rf::FixedMomentum, &effects).unwrap().response().unwrap();
+        let ours = Machine::new(Ring::paper_booster(), twin::Rf::FixedMomentum, &effects).unwrap().response().unwrap();
         let (x, y) = (matrix(&reference["response_x_m_per_rad"]), matrix(&reference["response_y_m_per_rad"]));
         let tolerance = tolerance(name);
         assert_near(&format!("{code} {name} x"), ours.x.as_slice(), x.as_slice(), tolerance[0]);
@@ -251,7 +251,7 @@ fn every_effect_acts_as_in_bmad() {
 
 /// The ring of a case, changed by hand, and what it holds.
 fn by_hand(case: &str) -> (Ring, Hold) {
-    let (mut ring, mut hold) = (Ring::booster(), ON_MOMENTUM);
+    let (mut ring, mut hold) = (Ring::paper_booster(), ON_MOMENTUM);
     let at = |name: &str| ring.element(name).unwrap();
     let (quadrupole, slot, dipole) = (at("QH_D8"), at("SLOT_F6"), at("B_C4"));
     match case {
@@ -295,8 +295,8 @@ fn kicks_of_the_same_size_give_every_effect_of_bmad() {
 /// Measured: off by 5.0e-7 m/rad from MAD-X, half of the last digit of the file, and by 7.4e-7 from pyAT; tunes by 5e-10 and 5e-9.
 #[test]
 fn the_deck_is_that_of_madx_and_pyat() {
-    let ring = Ring::built_in("booster-deck.json").unwrap();
-    let paper = system_tests::truth("recordings/deck/paper-vars", &ring);
+    let ring = Ring::booster();
+    let paper = system_tests::truth("recordings/paper-vars", &ring);
     for code in ["madx", "pyat"] {
         for (machine, vars) in [("design", vec![1.0; 48]), ("paper", paper.clone())] {
             let known = &golden("deck")[code][machine];

@@ -100,7 +100,7 @@ mod tests {
     /// At a held frequency the field moves the momentum by as much as an RF offset that changes the speed alike; Xsuite's ring gives -1.391.
     #[test]
     fn the_dipoles_field_moves_the_momentum_at_a_held_frequency() {
-        let ring = Ring::booster();
+        let ring = Ring::paper_booster();
         let optics = Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
         let per_field = optics.momentum_per_field();
         assert!((per_field + 1.391).abs() < 2e-3, "{per_field}");

@@ -226,7 +226,7 @@ mod tests {
         let ring = Ring::booster();
         let optics = crate::Optics::of(&ring, Hold::Momentum { delta: 0.0 }).unwrap();
         let eta = optics.momentum_compaction() - ring.particle.gamma(0.0).powi(-2);
-        assert!((eta + 0.106).abs() < 1e-3, "slip factor {eta}");
+        assert!((eta + 0.0997).abs() < 1e-3, "slip factor {eta}");
         let orbit = ClosedOrbit::find(&ring, Hold::Frequency { offset: 1e-6 }).unwrap();
         // second order in the offset: 1e-6 relative
         assert!((orbit.at[0][DELTA] * eta / -1e-6 - 1.0).abs() < 1e-4);
@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn a_ring_without_focusing_is_refused() {
-        let ring = Ring::booster();
+        let ring = Ring::paper_booster(); // dipoles of the other one focus a little in both planes
         let error = crate::Optics::of(&ring.with_vars(&[0.0; 48]), Hold::Momentum { delta: 0.0 }).unwrap_err();
         assert!(error.to_string().contains("half traces"), "{error}");
     }

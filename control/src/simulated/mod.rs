@@ -87,8 +87,8 @@ pub struct SimulatedMachine {
 /// Fluctuation of the main supplies from cycle to cycle, relative, and of the correctors [A]: those of the recordings that come with the project.
 const MAIN: f64 = 2e-4;
 const CORRECTOR: f64 = 0.02;
-/// RF frequency of the Booster at 1.5 GeV on its first harmonic [Hz]: `beta c / C`.
-const RF: f64 = 1.371e6;
+/// RF frequency of the Booster at 1.56 GeV on its first harmonic [Hz]: `beta c / C`.
+const RF: f64 = 1.3768e6;
 
 impl SimulatedMachine {
     /// The machine that a plan measures.

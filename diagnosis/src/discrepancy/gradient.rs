@@ -210,7 +210,7 @@ mod tests {
     /// A gradient moves the orbit of misaligned quadrupoles by what it kicks where that passes its own axis.
     #[test]
     fn a_gradient_kicks_an_orbit_off_its_axis() {
-        let mut ring = Ring::booster();
+        let mut ring = Ring::paper_booster();
         let changed = 17;
         for (i, quadrupole) in ring.quadrupoles.clone().iter().enumerate().filter(|(i, _)| *i != changed) {
             let misalignment = &mut ring.elements[quadrupole.element].misalignment;

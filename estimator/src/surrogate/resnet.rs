@@ -32,7 +32,7 @@ pub trait Trained {
 /// Input of the corrector that is set.
 pub const CORRECTOR: f32 = 5.0;
 /// Kick of its setting [rad].
-pub const SETTING_KICK: f32 = 0.2e-3;
+pub const SETTING_KICK: f32 = 0.277_91e-3;
 /// Orbit of an output of 1 [m].
 pub const ORBIT: f32 = 1e-3;
 /// Magnet currents among the inputs: dipole, QH, QV, SH, SV.

@@ -21,16 +21,16 @@ pub(super) const TARGETS: [Target; 4] = [
     Target { name: "truth", seeds: || vec![file("recordings/concealed/open-10/truth.json")], read: truth },
 ];
 
-static RING: LazyLock<Ring> = LazyLock::new(Ring::booster);
-static HEADER: LazyLock<String> = LazyLock::new(|| text("recordings/paper-vars/header.toml"));
+static RING: LazyLock<Ring> = LazyLock::new(Ring::paper_booster);
+static HEADER: LazyLock<String> = LazyLock::new(|| text("recordings/former/paper-vars/header.toml"));
 /// The first frames: what may be wrong with one does not need more.
 static FRAMES: LazyLock<String> =
-    LazyLock::new(|| text("recordings/paper-vars/frames.csv").split_inclusive('\n').take(40).collect());
+    LazyLock::new(|| text("recordings/former/paper-vars/frames.csv").split_inclusive('\n').take(40).collect());
 
 fn machines() -> [Vec<u8>; 4] {
     [
-        "machines/booster.json",
         "machines/booster-deck.json",
+        "machines/booster.json",
         "recordings/ten-cells/ring.json",
         "recordings/three-families/ring.json",
     ]

@@ -281,7 +281,7 @@ mod tests {
         (GreenModel::from_tables(&tables), ring, (0..48).map(|i| 1.0 + 0.03 * f64::sin(3.0 * f64::from(i))).collect())
     }
 
-    /// For kicks of 0.2 mrad and RF offsets of 2e-4, to the error that the tables state (2 um of largest error measured).
+    /// For kicks of 0.278 mrad and RF offsets of 2e-4, to the error that the tables state (2 um of largest error measured).
     #[test]
     fn it_predicts_as_the_twin() {
         let (model, ring, vars) = example();

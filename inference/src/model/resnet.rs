@@ -161,7 +161,7 @@ mod tests {
         (ResnetModel::from_green(GreenModel::from_tables(&tables)), vars)
     }
 
-    /// For kicks of 0.2 mrad, to four times the error that the tables state.
+    /// For kicks of 0.278 mrad, to four times the error that the tables state.
     #[test]
     fn it_predicts_as_the_twin() {
         let (model, vars) = example();

@@ -684,7 +684,7 @@ mod tests {
 
     #[test]
     fn a_machine_is_known_by_the_first_words_of_its_name() {
-        let booster = "AGS Booster (BNL), design model";
+        let booster = "AGS Booster (BNL), deck";
         for (name, known) in
             [("ags-booster", true), ("AGS", true), ("ags boost", false), ("", false), ("booster", false)]
         {

@@ -185,8 +185,8 @@ mod tests {
 
     /// A campaign of the repository, on the ring as designed.
     fn template() -> (Ring, Recording) {
-        let ring = Ring::booster();
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+        let ring = Ring::paper_booster();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/former/paper-vars");
         let recording = Recording::read(&folder, &ring).unwrap();
         (ring, recording)
     }

@@ -297,19 +297,19 @@ mod tests {
         );
         assert_eq!(
             message(r#"{"vars": [{"name": "01F", "mean": 1.0}]}"#),
-            "fit.json: no var \"01F\" in AGS Booster (BNL), design model; --machine names its file"
+            "fit.json: no var \"01F\" in AGS Booster (BNL), deck; --machine names its file"
         );
         assert_eq!(
             message(r#"{"vars": [{"name": "A2", "mean": 1.0}]}"#),
-            "fit.json: expected a var A4 of AGS Booster (BNL), design model, found none"
+            "fit.json: expected a var A4 of AGS Booster (BNL), deck, found none"
         );
         assert_eq!(
             message(r#"{"vars": [{"name": "A2", "mean": -1.0}]}"#),
             "fit.json: var A2: expected a mean above 0, found -1"
         );
         assert_eq!(
-            message(r#"{"lattice": "booster-deck.json", "vars": []}"#),
-            "fit.json, key lattice: expected \"booster.json\", found \"booster-deck.json\": the result is of another machine"
+            message(r#"{"lattice": "booster.json", "vars": []}"#),
+            "fit.json, key lattice: expected \"booster-deck.json\", found \"booster.json\": the result is of another machine"
         );
         assert!(message("{").starts_with("fit.json: EOF while parsing"));
     }

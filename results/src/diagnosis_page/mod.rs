@@ -111,8 +111,8 @@ mod tests {
 
     /// A campaign of the repository, on the ring as designed.
     fn template() -> (Ring, Recording) {
-        let ring = Ring::booster();
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
+        let ring = Ring::paper_booster();
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/former/paper-vars");
         let recording = Recording::read(&folder, &ring).unwrap();
         (ring, recording)
     }
@@ -263,7 +263,7 @@ mod tests {
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn where_tunes_decide_they_are_the_decisive_picture() {
         // a recording with a tune meter, of a drift
-        let ring = twin::Ring::booster();
+        let ring = twin::Ring::paper_booster();
         let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/concealed/open-09");
         let recording = Recording::read(&folder, &ring).unwrap();
         let diagnosis = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();

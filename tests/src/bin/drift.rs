@@ -34,7 +34,7 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<(), Box<dyn Error>> {
-    let ring = Ring::booster();
+    let ring = Ring::paper_booster();
     let committed = Stream::committed(&ring)?;
     let followed = drift::follow(&ring, &committed)?;
     std::fs::write(repository("docs/figures/drift-stream.svg"), figure(&ring, &committed, &followed).svg)?;

@@ -7,18 +7,18 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use comfy_table::CellAlignment;
-use inference::{Recording, stream};
+use inference::stream;
 use results::Names;
 use results::output::{self, table};
 use serde_json::{Value, json};
 use shared_memory::{PUBLISHER, Publisher, SERVICE};
 use system_tests::qemu::{Image, Sizes};
-use system_tests::repository;
+use system_tests::recording;
 use system_tests::sil::{Comparison, compare, largest};
 use twin::Ring;
 
 /// Recordings that are run through the chip, and the random walk of their vars.
-const RECORDINGS: [(&str, f32); 2] = [("recordings/paper-vars", 0.0), ("recordings/drift-stream", 2e-4)];
+const RECORDINGS: [(&str, f32); 2] = [("paper-vars", 0.0), ("random-vars", 2e-4)];
 
 /// Replay recordings through the emulated chip.
 #[derive(Debug, Parser)]
@@ -47,12 +47,12 @@ fn main() -> ExitCode {
 
 /// True if chip and host agree to the bit.
 fn run(arguments: &Arguments) -> Result<bool, Box<dyn Error>> {
-    let (image, ring) = (Image::build()?, Ring::booster());
+    let image = Image::build()?;
     let sizes = image.sizes()?;
-    let mut publisher = Publisher::try_new(&arguments.service, PUBLISHER, &Names::of(&ring))?;
+    let mut publisher = Publisher::try_new(&arguments.service, PUBLISHER, &Names::of(&Ring::booster()))?;
     let mut results = Vec::new();
     for (name, process_noise) in RECORDINGS {
-        let mut recording = Recording::read(&repository(name), &ring)?;
+        let (ring, mut recording) = recording(name);
         recording.rows.truncate(arguments.frames.unwrap_or(usize::MAX));
         let bar = orbitcal::progress(recording.rows.len(), "frames", false);
         let walk = stream::walk_per_cycle(&recording, process_noise, 0.0);

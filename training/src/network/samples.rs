@@ -5,7 +5,7 @@ use nalgebra::DMatrix;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
-use twin::{Hold, Optics, Ring, VariedRing, sobol};
+use twin::{Currents, Hold, Optics, Ring, VariedRing, sobol};
 
 use super::settings::of_var;
 
@@ -17,10 +17,8 @@ pub const SETTING: f64 = 22.0;
 const KICK: f64 = SETTING_KICK as f64 / SETTING;
 /// Standard deviation of every corrector's read-back about its setting [A], as recorded.
 const RIPPLE: f64 = 0.02;
-/// Standard deviation of the magnets' read-backs over nominal, as recorded; of the sextupoles', nominal is [`SEXTUPOLE`].
-pub const WIDTHS: [f64; CURRENTS] = [0.49 / 2400.0, 0.37 / 1800.0, 0.37 / 1790.0, 0.2, 0.2];
-/// Transfer polynomial of the quadrupoles' gradients over their current, as recorded.
-const TRANSFER: [f64; 6] = [0.0016, 1.0121, -0.0021, -0.0052, -0.0049, -0.0015];
+/// Standard deviation of the magnets' currents over nominal, as published of the dipoles, with which quadrupoles are in series; sextupoles act on no response.
+pub const WIDTHS: [f64; CURRENTS] = [6e-4, 6e-4, 6e-4, 0.2, 0.2];
 
 /// What makes samples.
 #[derive(Debug)]
@@ -32,8 +30,16 @@ pub struct Source {
     tunes: [f64; 2],
     /// Supply of each quadrupole: 1 QH, 2 QV among the currents.
     currents: Vec<usize>,
+    /// Integrated gradient by supply, a polynomial in its current over nominal.
+    gradients: Vec<Vec<f64>>,
     /// Monitors and correctors of x.
     first: (usize, usize),
+}
+
+/// By the supply law; without one in proportion to the current.
+fn gradient(ring: &Ring, supply: &str) -> Vec<f64> {
+    let by_law = |law: &Currents| Some(law.quadrupoles.get(supply)?.integrated.over(law.supply(supply)?));
+    ring.currents.as_ref().and_then(by_law).unwrap_or_else(|| vec![0.0, 1.0])
 }
 
 /// Samples of one plane, a column each.
@@ -62,6 +68,7 @@ impl Source {
             design: optics.response(&optics.read_monitors(), &optics.correctors()),
             tunes: [tunes.x.fract(), tunes.y.fract()],
             currents: ring.quadrupoles.iter().map(|q| 1 + q.supply.expect("a supply each")).collect(),
+            gradients: ring.supplies.iter().map(|supply| gradient(ring, &supply.name)).collect(),
             first: (ring.horizontal_monitors(), ring.horizontal_correctors()),
             ring: ring.clone(),
             varied,
@@ -106,8 +113,10 @@ impl Source {
         // evenly over as wide a range as three of the normal's widths
         let currents: [f64; CURRENTS] = core::array::from_fn(|i| 3.0 * WIDTHS[i] * (2.0 * point(params + i) - 1.0));
         let momentum = 1.0 + currents[0];
-        let transfer = |r: f64| TRANSFER.iter().rev().fold(0.0, |sum, c| sum * r + c);
-        let factor = |supply: usize| transfer(1.0 + currents[supply]) / transfer(1.0) / momentum;
+        let factor = |supply: usize| {
+            let gradient = |current: f64| self.gradients[supply - 1].iter().rev().fold(0.0, |sum, c| sum * current + c);
+            gradient(1.0 + currents[supply]) / gradient(1.0) / momentum
+        };
         let each = self.ring.quadrupoles.iter().zip(&self.currents);
         let factors: Vec<f64> =
             each.map(|(q, supply)| q.parameter.map_or(1.0, |p| vars[p]) * factor(*supply)).collect();

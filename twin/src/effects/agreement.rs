@@ -235,8 +235,8 @@ fn linear_readings_are_those_of_exact_orbits() {
             EffectKind::QuadDrift => 2.5e-6,
             _ => 0.0,
         };
-        // measured 6e-4: kinematic terms of slopes of 1 mrad
-        assert!(kicked < 2e-3 * change + second, "{effect:?}: {kicked:e} of {change:e}");
+        // measured 2.5e-3: kinematic terms of slopes of 1 mrad, and sextupoles of the dipoles
+        assert!(kicked < 4e-3 * change + second, "{effect:?}: {kicked:e} of {change:e}");
         // measured 0.051: second order of a momentum of 1e-3, which a gradient or an offset changes
         assert!(rf < 0.07 * change, "{effect:?}: {rf:e} of {change:e}");
         assert!(tune < 1e-4, "{effect:?}: {tune:e}");
@@ -250,8 +250,8 @@ fn what_depends_on_the_orbit_is_that_of_exact_orbits() {
         let [kicked, rf, change, tune] = compare(&Ring::booster(), &ring, &effect);
         // measured 0.036: the orbit is taken at the entrance of a sextupole, not in its middle
         assert!(kicked < 0.05 * change, "{effect:?}: {kicked:e} of {change:e}");
-        // measured 0.061: the dispersion of the two displaced quadrupoles
-        assert!(rf < 0.1 * change, "{effect:?}: {rf:e} of {change:e}");
+        // measured 0.11: the dispersion of the two displaced quadrupoles, and of the sextupoles of the dipoles on this orbit
+        assert!(rf < 0.15 * change, "{effect:?}: {rf:e} of {change:e}");
         assert!(tune < 1e-3, "{effect:?}: {tune:e}");
     }
 }

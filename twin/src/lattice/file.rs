@@ -107,14 +107,19 @@ const ROUNDING: f64 = 1e-6;
 
 /// Built-in machines: names and texts of their files. The first is taken where none is named.
 pub const BUILT_IN: [(&str, &str); 2] = [
-    ("booster.json", include_str!("../../../machines/booster.json")),
     ("booster-deck.json", include_str!("../../../machines/booster-deck.json")),
+    ("booster.json", include_str!("../../../machines/booster.json")),
 ];
 
 impl Ring {
-    /// The AGS Booster of `machines/booster.json`.
+    /// The AGS Booster of its laboratory's deck, `machines/booster-deck.json`.
     pub fn booster() -> Self {
         Self::of_built_in(BUILT_IN[0])
+    }
+
+    /// The AGS Booster as its published inference describes it, `machines/booster.json`: dipoles without a gradient, and fewer currents.
+    pub fn paper_booster() -> Self {
+        Self::of_built_in(BUILT_IN[1])
     }
 
     /// A built-in machine by the name of its file, as headers of recordings state it.

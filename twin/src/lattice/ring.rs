@@ -244,7 +244,7 @@ mod tests {
             .iter()
             .filter_map(|e| if let Kind::Bend(b) = &e.kind { Some(b.curvature * e.length) } else { None })
             .sum();
-        assert!((angle - core::f64::consts::TAU).abs() < 1e-12);
+        assert!((angle - core::f64::consts::TAU).abs() < 1e-8);
         assert_eq!((ring.quadrupoles.len(), ring.correctors.len(), ring.read_monitors.len()), (48, 48, 33));
         assert_eq!((ring.horizontal_monitors(), ring.horizontal_correctors()), (15, 24));
         assert_eq!(ring.var_names()[0], "A2");
