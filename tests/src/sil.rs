@@ -139,10 +139,13 @@ pub fn bits(e: &Estimate) -> Vec<u64> {
     numbers.into_iter().chain(remarks).chain(masks).chain(rest).chain(floats).chain(health).collect()
 }
 
-/// Most instructions of each region in the second half of a run, in the order of [`REGIONS`]: by then it is known where the correctors stand, and no var is at
-/// a bound.
+/// Most instructions of each region, in the order of [`REGIONS`]: of a slice in the whole run, of a frame in its second half. By then it is known where the
+/// correctors stand, and no var is at a bound.
 pub fn largest(counts: &Counts) -> Vec<(&'static str, u64)> {
-    let half = |name: &str| counts.get(name).map(|runs| &runs[runs.len() / 2..]);
-    let most = |name: &str| half(name).and_then(|runs| runs.iter().max()).copied().unwrap_or(0);
-    REGIONS.iter().map(|(word, name)| (*word, most(name))).collect()
+    let most = |(word, name): &(&'static str, &str)| {
+        let runs = counts.get(*name).map_or(&[][..], Vec::as_slice);
+        let first = if *word == "slice" { 0 } else { runs.len() / 2 };
+        (*word, runs[first..].iter().copied().max().unwrap_or(0))
+    };
+    REGIONS.iter().map(most).collect()
 }
