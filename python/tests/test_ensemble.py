@@ -347,7 +347,7 @@ def test_a_case_without_a_beam_has_all_columns(ten_cells):
 
 
 def test_a_validation_is_that_of_the_program(booster, cluster, tmp_path):
-    """Two campaigns of `orbitcal validate recordings/former/paper-vars --machine machines/booster.json --empty 0 --single 2 --pair 0 --unknown 0 --seed 1`, by its outcomes."""
+    """Two campaigns of `orbitcal validate recordings/former/paper-vars --empty 0 --single 2 --pair 0 --unknown 0 --seed 1`, by its outcomes."""
     template = orbitcal.Recording.read(RECORDINGS / "former/paper-vars", booster)
     table = ensemble.run(ensemble.Validation(template, "single"), [0, 1], tmp_path, client=cluster, progress=False)
     made = [["bpm_swap@y_A5,y_A7"], ["corrector_polarity@H_B4"]]

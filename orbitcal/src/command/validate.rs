@@ -9,7 +9,7 @@ use twin::limits::FILE;
 use twin::{EffectKind, Ring};
 use validation::{CampaignError, Case, Cases, Class, Outcome, Tables, UnmodelledKind, known, run_all};
 
-use super::{CommandError, check_outputs, machine, progress, recording};
+use super::{CommandError, check_outputs, machine_for, progress, recording};
 use crate::cli::Validate;
 
 /// Run it.
@@ -18,11 +18,11 @@ use crate::cli::Validate;
 /// [`CommandError`].
 pub fn run(options: &Validate) -> Result<(), CommandError> {
     check_outputs([options.common.json.as_deref(), options.page.as_deref()])?;
-    let ring = machine(options.common.machine.as_deref())?;
+    let ring = machine_for(&options.template, options.common.machine.as_deref())?;
     let template = recording(&options.template, &ring)?;
     // which cases there are depends on the kinds
     let kinds = (EffectKind::ALL.len(), UnmodelledKind::ALL.len());
-    let key = format!("{} {} {} {}", template.name, options.seed, kinds.0, kinds.1);
+    let key = format!("{} {} {} {} {}", ring.file, template.name, options.seed, kinds.0, kinds.1);
     let known = known(&options.outcomes, &key).map_err(failed)?;
     let cases = cases(options, &ring, &template)?;
     let to_do: Vec<&Case> = cases.iter().filter(|case| !known.contains_key(&case.index)).collect();
