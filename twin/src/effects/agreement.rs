@@ -256,6 +256,20 @@ fn what_depends_on_the_orbit_is_that_of_exact_orbits() {
     }
 }
 
+/// And one of no size adds nothing, whatever field the ring itself has there.
+#[test]
+fn effects_on_one_sextupole_add_up() {
+    let (ring, orbit) = (Ring::booster(), orbit(&displaced(), 0.0));
+    let seen = |amplitudes: &[f64]| {
+        let sextupole = |amplitude: &f64| Effect::parse(&format!("sextupole_error@SX_A5={amplitude}"), &ring).unwrap();
+        let with: Vec<Effect> = amplitudes.iter().map(sextupole).collect();
+        machine(&ring, &with).on_orbit(&orbit).response().unwrap().x
+    };
+    let apart = |one: &[f64], other: &[f64]| (seen(one) - seen(other)).amax();
+    let same = [apart(&[1.0, 2.0], &[3.0]), apart(&[0.0], &[])];
+    assert!(same.iter().all(|apart| *apart < 1e-9) && apart(&[1.0], &[3.0]) > 1e-3, "{same:?}");
+}
+
 #[test]
 fn what_crosses_curved_fields_moves_the_tunes() {
     let ring = Ring::booster();

@@ -389,13 +389,15 @@ impl Machine {
         let mut machine = self.clone();
         for &Curved { element: at, k2l, k3l } in &self.curved {
             let ([x, y], element) = (orbit[at], &mut machine.ring.elements[at]);
-            let k2 = k2l / element.length;
             match &mut element.kind {
                 Kind::Sextupole { .. } => {
-                    element.kind = Kind::Quadrupole { k1: k2 * x.hypot(y) };
+                    // of all effects there: what it becomes is no sextupole for the next of them
+                    let there = self.curved.iter().filter(|one| one.element == at).map(|one| one.k2l);
+                    element.kind = Kind::Quadrupole { k1: there.sum::<f64>() / element.length * x.hypot(y) };
                     element.misalignment.roll = -0.5 * y.atan2(x);
                 }
                 Kind::Bend(bend) => {
+                    let k2 = k2l / element.length;
                     bend.k1 += k2 * across(orbit, at)[0];
                     bend.k2 -= k2;
                 }
