@@ -38,6 +38,8 @@ pub struct Imperfection {
 
 /// Standard deviations from zero from which on one counts as seen.
 const SEEN: f64 = 2.0;
+/// The same for a property of the whole ring to be certain: chance makes one of ten as large in one recording of 1600.
+const CERTAIN: f64 = 4.0;
 
 impl Imperfection {
     /// True if the recording shows it.
@@ -48,6 +50,12 @@ impl Imperfection {
     /// True if it is larger than twice what is ordinary.
     pub fn is_large(&self) -> bool {
         self.is_seen() && self.measured.value.abs() > 2.0 * self.ordinary
+    }
+
+    /// True if a sentence says it: it is large, or all have it in common beyond doubt.
+    fn is_told(&self) -> bool {
+        let is_certain = self.measured.value.abs() > CERTAIN * self.measured.sigma;
+        self.is_large() || self.measure == Measure::Mean && is_certain
     }
 
     /// As a row of a table: what it is, its size, what is ordinary, and a remark.
@@ -62,9 +70,9 @@ impl Imperfection {
         format!("{} {}", self.what(), self.size())
     }
 
-    /// Those that are larger than ordinary, with their sizes; none without any.
-    pub fn large(all: &[Self]) -> Option<String> {
-        let said: Vec<String> = all.iter().filter(|one| one.is_large()).map(Self::said).collect();
+    /// Those that a sentence says, with their sizes: larger than ordinary, or certain in all of a kind; none without any.
+    pub fn told(all: &[Self]) -> Option<String> {
+        let said: Vec<String> = all.iter().filter(|one| one.is_told()).map(Self::said).collect();
         (!said.is_empty()).then(|| said.join(", "))
     }
 
@@ -99,5 +107,7 @@ mod tests {
         assert_eq!(one(0.05).row(), ["gains of monitors", "5.00 ± 0.40 % rms", "2.0 %", "large"]);
         assert_eq!(one(0.05).said(), "gains of monitors 5.00 ± 0.40 % rms");
         assert!(!one(0.03).is_large() && one(0.03).is_seen() && !one(0.007).is_seen());
+        let common = |value: f64| Imperfection { measure: Measure::Mean, ..one(value) };
+        assert!(!one(0.03).is_told() && common(0.03).is_told() && !common(0.015).is_told());
     }
 }

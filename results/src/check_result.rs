@@ -133,7 +133,7 @@ impl CheckResult {
             tunes: tunes.map(|t| DesignTunes { x: t.x, y: t.y }),
             monitors: monitors(ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
             imperfections: off.iter().map(ImperfectionResult::from).collect(),
-            off: Imperfection::large(&off),
+            off: Imperfection::told(&off),
             silent_monitors: (0..names.len()).filter(silent).map(|b| names[b].clone()).collect(),
             missing: readings.iter().filter(|reading| reading.is_nan()).count() as f64 / readings.len().max(1) as f64,
             commands: vec![replay(campaign), fit(campaign), study(campaign), diagnose(campaign), device(campaign)],

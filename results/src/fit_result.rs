@@ -251,7 +251,7 @@ impl FitResult {
             calibrated,
             lack: fit.lack.map(|lack| lack.to_string()),
             monitors: monitors(&campaign.ring, &campaign.screened.health, &campaign.screened.excluded.tallies()),
-            off: Imperfection::large(&fit.imperfections()),
+            off: Imperfection::told(&fit.imperfections()),
             imperfections: fit.imperfections().iter().map(ImperfectionResult::from).collect(),
             log_evidence: None,
             timing: None,
