@@ -14,7 +14,7 @@
 //! C that of the fit: never wider than the prior. J and S have to be of one machine: with C for the inverse, which is that of another, the stiffest directions leak into the others.
 //!
 //! To first order about the design, with the header's noise and one baseline a monitor; what the readings tell of `b` is not used, nor is the shift of the vars that their prior tells of it. Of two decks of one
-//! machine, each fitted with the other's ring, the NEES per var is 0.7 to 1.3, where without it is up to 3.4 (`tests/deck.rs`).
+//! machine, each fitted with the other's ring, the NEES per var is 0.7 to 1.3, where without it is up to 3.4 (`deck.rs` among the tests of `diagnosis`).
 
 use nalgebra::{DMatrix, DVector};
 use rand::rngs::StdRng;
