@@ -334,6 +334,11 @@ impl Fitted {
         data.stacked(|campaign, own| Ok(own.residual(&self.predicted_at(data, campaign, &self.u)?)))
     }
 
+    /// Its cost for other readings; infinite where its machine keeps no beam in them.
+    pub(crate) fn cost_of(&self, data: &Data) -> f64 {
+        self.residual_of(data).map_or(f64::INFINITY, |residual| residual.norm_squared() + self.u.norm_squared())
+    }
+
     fn predicted_at(&self, data: &Data, campaign: usize, u: &DVector<f64>) -> Result<Signature, EffectError> {
         predicted_by(data, &self.hypothesis, campaign, u)
     }

@@ -24,21 +24,29 @@ pub(super) fn fit(data: &mut Data, hypothesis: &Hypothesis, guess: &DVector<f64>
     if let Some((without_jumps, again)) = trimmed(data, &fitted) {
         (*data, fitted) = (without_jumps, again);
     }
+    (*data, fitted) = relinearised(data.clone(), fitted);
+    Ok(fitted)
+}
+
+/// A fit to readings that are linearised about the fit before, as long as that lowers its cost with exact orbits. Next to an integer tune a pass may go
+/// further away, and about a machine that keeps no beam in one of the settings there is none: the fit before is then the better.
+fn relinearised(mut data: Data, mut fitted: Fitted) -> (Data, Fitted) {
+    let (mut before, mut least) = (None, f64::INFINITY);
     for _ in 0..PASSES {
-        let mut linearised = data.clone();
-        // a machine that keeps no beam in one of the settings is not the one that was recorded
-        let Ok(moved) = linearised.linearise_each(&fitted) else { break };
-        let Ok(again) = Fitted::from_guess(&linearised, hypothesis, &fitted.u) else { break };
-        // nor is one that is far off, whose exact orbits may be metres: each pass then goes further away
-        if again.is_poor() && again.cost > fitted.cost {
-            break;
+        let mut about = data.clone();
+        let moved = about.linearise_each(&fitted);
+        let exact = if moved.is_ok() { fitted.cost_of(&about) } else { f64::INFINITY };
+        if exact >= least {
+            return before.unwrap_or((data, fitted));
         }
-        (*data, fitted) = (linearised, again);
-        if moved < CURVED {
+        let Ok(again) = Fitted::from_guess(&about, &fitted.hypothesis, &fitted.u) else { break };
+        before = Some((core::mem::replace(&mut data, about), core::mem::replace(&mut fitted, again)));
+        least = exact;
+        if moved.is_ok_and(|moved| moved < CURVED) {
             break;
         }
     }
-    Ok(fitted)
+    (data, fitted)
 }
 
 /// The data without the readings of faulty monitors that lie far from a fit, and the fit to them. None where there are no such readings, and of a poor fit where
@@ -55,23 +63,13 @@ fn trimmed(data: &Data, fitted: &Fitted) -> Option<(Data, Fitted)> {
 }
 
 /// A fit to readings that were linearised about a machine with further effects: the same to readings of its own, where these differ.
-pub(super) fn about_itself(data: &Data, mut fitted: Fitted) -> Fitted {
-    let mut relinearised = fitted.data(data).clone();
-    for pass in 0..PASSES {
-        if fitted.is_poor() {
-            break;
-        }
-        let Ok(moved) = relinearised.linearise_each(&fitted) else { break };
-        if pass == 0 && moved < CURVED {
-            break;
-        }
-        let Ok(again) = Fitted::from_guess(&relinearised, &fitted.hypothesis, &fitted.u) else { break };
-        fitted = again.keeping(&relinearised);
-        if moved < CURVED {
-            break;
-        }
+pub(super) fn about_itself(data: &Data, fitted: Fitted) -> Fitted {
+    let data = fitted.data(data);
+    if fitted.is_poor() || data.clone().linearise_each(&fitted).is_ok_and(|moved| moved < CURVED) {
+        return fitted;
     }
-    fitted
+    let (own, again) = relinearised(data.clone(), fitted);
+    again.keeping(&own)
 }
 
 #[cfg(test)]
