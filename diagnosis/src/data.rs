@@ -59,6 +59,8 @@ pub struct Data {
     pub units: Units,
     /// Mean kicks, RF offset and time of each pool, and the orbit without kicks.
     pub drives: Drives,
+    /// The settings of the pools.
+    pub settings: Settings,
     /// Size, changes and uncertainty of that orbit.
     pub baseline: Baseline,
     /// Shift of the tunes by the orbit without kicks, which [`Machine::readings`] leaves out, in the machine that the readings are linearised about.
@@ -288,6 +290,7 @@ impl Data {
         let has_same_monitors = |i: usize| sharing.iter().all(|&b| excluded.counts(i, b) == excluded.counts(i - 1, b));
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
         let pools = Pools::from_settings(&campaign.settings.repeatable, is_like_before);
+        let of_pools = pools.drives(&drives);
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),
@@ -310,7 +313,8 @@ impl Data {
             believed,
             drift: 0.0,
             is_about_effects: false,
-            drives: pools.drives(&drives),
+            settings: Settings::from_drives(&of_pools),
+            drives: of_pools,
             pools,
             frames: Frames {
                 drives,
@@ -414,7 +418,8 @@ impl Data {
 
     /// A hypothetical campaign with other drives, by itself; its readings are ignored.
     pub(crate) fn driven_by(&self, drives: &Drives) -> Self {
-        let mut data = Self { drives: drives.clone(), others: Vec::new(), ..self.clone() };
+        let (drives, settings) = (drives.clone(), Settings::from_drives(drives));
+        let mut data = Self { drives, settings, others: Vec::new(), ..self.clone() };
         data.noise.levels = Levels::CONSTANT;
         data.prepare();
         data
@@ -537,8 +542,7 @@ impl Data {
 
     /// Correctors that were moved, by index.
     pub fn driven_correctors(&self) -> Vec<usize> {
-        let settings = Settings::from_drives(&self.drives);
-        (0..self.drives.kick.ncols()).filter(|&c| settings.moves(c)).collect()
+        (0..self.drives.kick.ncols()).filter(|&c| self.settings.moves(c)).collect()
     }
 
     /// Monitors that have readings which count, by index.

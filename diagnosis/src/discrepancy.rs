@@ -18,7 +18,6 @@ mod marginal;
 mod sums;
 
 use estimator::MonitorState;
-use inference::Settings;
 use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{Plane, Signature, Signatures};
 
@@ -60,7 +59,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     let data = all.campaign(campaign);
     let linearised = Linearised::from_fit(fitted);
     let whitened = Seen::from_fit(fitted, all.parts().swap_remove(campaign));
-    let settings = Settings::from_drives(&data.drives);
+    let settings = &data.settings;
     let monitors = data.monitors();
     let seen = Seen::taken_back(data, &whitened);
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
@@ -233,7 +232,7 @@ mod tests {
         let (ring, recording) = template();
         let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
-        let (linearised, settings) = (Linearised::from_fit(&fitted), Settings::from_drives(&data.drives));
+        let (linearised, settings) = (Linearised::from_fit(&fitted), &data.settings);
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
         let seen = seen_of(&data, &fitted);
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
@@ -296,7 +295,7 @@ mod tests {
             let (near, exact) = (evidence(&data.sums(b, &seen, &stretches)), evidence(&whole(&alone, &stretches)));
             largest = largest.max((near - exact).abs());
         }
-        let indicator = Settings::from_drives(&data.drives).indicator();
+        let indicator = data.settings.indicator();
         let sums: Vec<Sums> = (0..data.monitors()).map(|b| data.sums(b, &seen, &indicator)).collect();
         let (machine, drives) = fitted.machine(&data).unwrap();
         let read = |pattern: &DVector<f64>| {

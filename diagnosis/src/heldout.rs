@@ -19,7 +19,6 @@
 
 use estimator::MonitorState;
 use evidence::{Factor, gram};
-use inference::Settings;
 use nalgebra::{DMatrix, DVector};
 
 use super::choice::Choice;
@@ -50,9 +49,8 @@ pub fn by_pool(data: &Data) -> Vec<Block> {
 pub fn by_corrector(data: &Data) -> Vec<Block> {
     let mut blocks = vec![Block::new(); data.drives.kick.ncols()];
     for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
-        let settings = Settings::from_drives(&own.drives);
         for pool in 0..own.pools.count {
-            if let Some((corrector, _)) = settings.kick(pool) {
+            if let Some((corrector, _)) = own.settings.kick(pool) {
                 blocks[corrector].push(pools.start + pool);
             }
         }

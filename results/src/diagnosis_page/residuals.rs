@@ -1,7 +1,6 @@
 //! Residuals of the readings, setting by setting.
 
 use diagnosis::{Data, Diagnosis, FitError, Fitted};
-use inference::Settings;
 use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Map, Section};
 use twin::Plane;
@@ -38,7 +37,7 @@ pub struct Residuals {
 impl Residual {
     /// Whitened numbers of some data as residuals, those of the tunes left out.
     pub fn all(data: &Data, whitened: &DVector<f64>) -> Vec<Self> {
-        let settings = Settings::from_drives(&data.drives);
+        let settings = &data.settings;
         let horizontal: Vec<bool> = data.ring.correctors.iter().map(|c| c.plane == Plane::X).collect();
         let planes: Vec<bool> = data.ring.monitors_read().map(|m| m.plane == Plane::X).collect();
         let of = |(((pool, monitor), noise), &value): (((usize, usize), f64), &f64)| {

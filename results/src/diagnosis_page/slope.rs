@@ -8,7 +8,6 @@
 use std::collections::BTreeMap;
 
 use diagnosis::{Finding, Shown, capitalised};
-use inference::Settings;
 use report::{Axes, Figure, Series};
 
 use super::partial::Partial;
@@ -227,7 +226,7 @@ fn line(x: &[f64], slope: f64, sigma: f64, finding: &Finding, is_switch: bool) -
 /// Means over the readings of each monitor at each setting, the signature per so many steps of the amplitude.
 fn of_settings(partial: &Partial, per: f64) -> Vec<Point> {
     let data = partial.data;
-    let settings = Settings::from_drives(&data.drives);
+    let settings = &data.settings;
     let mut all: BTreeMap<(usize, usize), Point> = BTreeMap::new();
     for (i, ((pool, monitor), noise)) in data.places().into_iter().zip(data.noise_of_means()).enumerate() {
         if monitor >= data.monitors() {

@@ -1,7 +1,6 @@
 //! The decisive picture of an unmodelled discrepancy: the residuals at its place.
 
 use diagnosis::{Diagnosis, Discrepancy, FitError, Location, capitalised, steering};
-use inference::Settings;
 use nalgebra::DVector;
 use report::{Axes, Figure, Map, Reference, Series};
 use twin::{Hold, Optics, Plane, Signatures};
@@ -274,7 +273,7 @@ impl Left<'_> {
     /// The mean of each setting, from those of runs of frames.
     fn in_settings(&self, axis: &str, runs: &[Mean]) -> Figure {
         let data = self.partial.data;
-        let (driven, settings) = (data.driven_correctors(), Settings::from_drives(&data.drives));
+        let (driven, settings) = (data.driven_correctors(), &data.settings);
         let of_sign = |wanted: f64| {
             let mut means = vec![Mean::default(); driven.len()];
             for (run, mean) in runs.iter().enumerate() {
