@@ -582,7 +582,7 @@ mod tests {
 
     fn booster(name: &str) -> (Ring, Recording) {
         let at = folder().join(name);
-        let ring = Recording::lattice(&at).and_then(|lattice| Ring::built_in(&lattice)).unwrap();
+        let ring = Recording::built_in_ring(&at).unwrap();
         let recording = Recording::read(&at, &ring).unwrap();
         (ring, recording)
     }

@@ -70,7 +70,7 @@ const NOISE: f32 = 0.05;
 #[test]
 fn readings_and_states_are_those_of_the_core() {
     for folder in folders() {
-        let ring = Recording::lattice(&folder).and_then(|lattice| Ring::built_in(&lattice)).unwrap();
+        let ring = Recording::built_in_ring(&folder).unwrap();
         let names = ring.monitor_names();
         let recording = Recording::read(&folder, &ring).unwrap();
 

@@ -28,7 +28,7 @@ pub fn repository(path: &str) -> PathBuf {
 /// If it cannot be read.
 pub fn recording(name: &str) -> (Ring, Recording) {
     let folder = repository("recordings").join(name);
-    let ring = Recording::lattice(&folder).and_then(|lattice| Ring::built_in(&lattice)).expect("of a built-in machine");
+    let ring = Recording::built_in_ring(&folder).expect("of a built-in machine");
     let recording = Recording::read(&folder, &ring).expect("a recording of the repository");
     (ring, recording)
 }

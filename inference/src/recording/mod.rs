@@ -60,6 +60,11 @@ impl Recording {
         header::lattice(&text(&folder.join(HEADER), SETTINGS).ok()?)
     }
 
+    /// The built-in machine that a campaign's header names, if it does.
+    pub fn built_in_ring(folder: &Path) -> Option<Ring> {
+        Ring::built_in(&Self::lattice(folder)?)
+    }
+
     /// The same from the texts of the two files; `folder` gives the recording its name and appears in errors.
     ///
     /// # Errors
