@@ -157,7 +157,7 @@ impl Header {
 
     pub(super) fn parse(file: &Path, text: &str, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
         let text = Text { file, text };
-        text.check_name(ring)?;
+        text.check_names(ring)?;
         let mut header = match text.format()? {
             Format::One => text.first(ring)?,
             Format::Two => text.second(ring, names)?,
@@ -401,28 +401,36 @@ impl Text<'_> {
         values.into_iter().collect::<Option<_>>().ok_or_else(missing)
     }
 
-    /// The machine has to be the ring's, whatever else may be wrong: the header of another one lacks this one's supplies.
-    fn check_name(&self, ring: &Ring) -> Result<(), RecordingError> {
+    /// Machine and lattice have to be the ring's, whatever else may be wrong: the header of another one lacks this one's supplies.
+    fn check_names(&self, ring: &Ring) -> Result<(), RecordingError> {
         #[derive(Deserialize)]
         struct Probe {
             machine: Option<toml::Value>,
+            lattice: Option<toml::Value>,
         }
         // what is wrong elsewhere is found by the strict reading
-        let Ok(Probe { machine: Some(toml::Value::String(name)) }) = toml::from_str(self.text) else { return Ok(()) };
-        if begins(&ring.name, &name) {
-            return Ok(());
+        let Ok(Probe { machine, lattice }) = toml::from_str(self.text) else { return Ok(()) };
+        let refuse = |key, expected: &str, found: &str| {
+            Err(RecordingError::Machine(self.key(key).mismatch(format!("{expected:?}"), format!("{found:?}"))))
+        };
+        if let Some(toml::Value::String(name)) = machine
+            && !begins(&ring.name, &name)
+        {
+            return refuse("machine", &ring.name, &name);
         }
-        Err(RecordingError::Machine(self.key("machine").mismatch(format!("{:?}", ring.name), format!("{name:?}"))))
+        if let Some(toml::Value::String(file)) = lattice
+            && file != ring.file
+        {
+            return refuse("lattice", &ring.file, &file);
+        }
+        Ok(())
     }
 
-    /// Lattice, particle and energy have to be the ring's.
+    /// Particle and energy have to be the ring's.
     fn check_machine(&self, header: &Header, ring: &Ring) -> Result<(), RecordingError> {
         let refuse = |key, expected: &dyn fmt::Display, found: &dyn fmt::Display| {
             Err(RecordingError::Machine(self.key(key).mismatch(expected, found)))
         };
-        if header.lattice != ring.file {
-            return refuse("lattice", &format!("{:?}", ring.file), &format!("{:?}", header.lattice));
-        }
         if header.particle != ring.particle.name() {
             return refuse("particle", &format!("{:?}", ring.particle.name()), &format!("{:?}", header.particle));
         }
