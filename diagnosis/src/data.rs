@@ -361,13 +361,22 @@ impl Data {
         Ok(self.whiten(|c, pool| self.readings[(pool, c)] - before[(pool, c)]).norm_squared())
     }
 
-    /// Drop readings of faulty monitors that lie far from a fit: jumps that the screening accepted as the first reading of a setting. True if
-    /// there are any.
+    /// Drop jumps that the screening accepted as the first reading of a setting: readings of faulty monitors that lie far from a fit, and single ones of any
+    /// monitor, further off than all others of it and of its pool together, as nothing makes them that the machine does. True if there are any.
     pub fn trim(&mut self, residual: &DVector<f64>) -> bool {
-        let places = self.places().into_iter().zip(residual.iter()).filter(|(_, r)| r.abs() > FAULTY);
-        let is_faulty =
-            |(_, c): &(usize, usize)| self.health().get(*c).is_some_and(|one| one.state != MonitorState::Ok);
-        let dropped: Vec<(usize, usize)> = places.map(|(place, _)| place).filter(is_faulty).collect();
+        let places = self.places();
+        let (mut of_pools, mut of_columns) = (vec![0.0; self.pools.count], vec![0.0; self.monitors() + 2]);
+        for ((pool, c), r) in places.iter().zip(residual.iter()) {
+            of_pools[*pool] += r * r;
+            of_columns[*c] += r * r;
+        }
+        let is_jump = |((pool, c), r): &((usize, usize), &f64)| {
+            let is_faulty = self.health().get(*c).is_some_and(|one| one.state != MonitorState::Ok);
+            let rest = of_pools[*pool] + of_columns[*c] - 2.0 * *r * *r;
+            *c < self.monitors() && (is_faulty && r.abs() > FAULTY || *r * *r > rest)
+        };
+        let dropped: Vec<(usize, usize)> =
+            places.into_iter().zip(residual.iter()).filter(is_jump).map(|(place, _)| place).collect();
         for (frame, pool) in self.pools.of_frame.iter().enumerate() {
             for &(_, b) in dropped.iter().filter(|(dropped, _)| dropped == pool) {
                 self.screened.excluded.exclude(frame, b, Excluded::Poor);
