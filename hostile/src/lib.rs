@@ -2,7 +2,7 @@
 //! program does; [`attack()`] runs it once and says what is wrong: a panic, more time or more memory than the limits of docs/limits.md allow.
 //!
 //! `make fuzz` mutates good files, the seeds of each target; inputs that once were too much for a reader stand in `corpus/TARGET`, and a
-//! test reads them all again. The same targets run under libFuzzer, where it is installed: fuzz/fuzz_targets/any.rs.
+//! test reads them all again. The same targets run under libFuzzer: fuzz/fuzz_targets/any.rs.
 
 mod attack;
 mod mutation;
