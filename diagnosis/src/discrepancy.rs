@@ -63,7 +63,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepan
     let monitors = data.monitors();
     let seen = Seen::taken_back(data, &whitened);
     let sums: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &settings.indicator())).collect();
-    let apart: Vec<Apart> = (0..monitors).map(|b| Apart::from_sums(data, b, &settings, &sums[b])).collect();
+    let apart: Vec<Apart> = (0..monitors).map(|b| Apart::from_sums(data, b, settings, &sums[b])).collect();
     let stretches = stretches(data);
     let steps: Vec<Sums> = (0..monitors).map(|b| data.sums(b, &seen, &stretches)).collect();
     // faulty monitors scatter by themselves
@@ -237,7 +237,7 @@ mod tests {
         let seen = seen_of(&data, &fitted);
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
         let each = sums.each_ref().map(|sums| sums.select(&some));
-        let apart = [0, 1, 2].map(|i| Apart::from_sums(&data, monitors[i], &settings, &sums[i]).select(&some));
+        let apart = [0, 1, 2].map(|i| Apart::from_sums(&data, monitors[i], settings, &sums[i]).select(&some));
         for (sums, apart) in each.iter().zip(&apart) {
             let gram = DMatrix::from_diagonal(&apart.alone) - &apart.common * apart.common.transpose();
             assert!((gram - &sums.gram).amax() < 1e-9 * sums.gram.amax(), "rounding");
