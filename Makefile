@@ -161,7 +161,7 @@ soft-ioc: build .venv-control ## the simulated Booster behind a soft IOC, on CA 
 gateway: .venv-control ## published estimates as EPICS records and an NTTable, as config/gateway.toml says
 	.venv-control/bin/orbitcal-gateway config/gateway.toml
 
-validate: build ## how often the diagnosis is right: 868 blind campaigns, less those without a beam, a quarter of an hour on two cores; a stopped run resumes (`rm target/validate.jsonl` starts anew)
+validate: build ## how often the diagnosis is right: 868 blind campaigns, less those without a beam, half an hour on two cores; a stopped run resumes (`rm target/validate.jsonl` starts anew)
 	$(ORBITCAL) validate recordings/paper-vars --seed 6 --outcomes target/validate.jsonl --page docs/diagnosis.md --json target/validate.json
 
 adversary: build .venv ## 220 blind campaigns by pyAT of machines with ordinary imperfections, simulated by a program written without sight of the diagnosis, and their scores; an hour
