@@ -65,7 +65,8 @@ fn trimmed(data: &Data, fitted: &Fitted) -> Option<(Data, Fitted)> {
 /// A fit to readings that were linearised about a machine with further effects: the same to readings of its own, where these differ.
 pub(super) fn about_itself(data: &Data, fitted: Fitted) -> Fitted {
     let data = fitted.data(data);
-    if fitted.is_poor() || data.clone().linearise_each(&fitted).is_ok_and(|moved| moved < CURVED) {
+    let differ = !fitted.is_poor() && data.clone().linearise_each(&fitted).is_ok_and(|moved| moved >= CURVED);
+    if !differ {
         return fitted;
     }
     let (own, again) = relinearised(data.clone(), fitted);

@@ -452,7 +452,7 @@ pub fn sentence(
     let mut said: Vec<String> = contradicted.chain(beyond.iter().map(OutOfRange::to_string)).collect();
     let rows = widths::rows(data, &found.best).into_iter();
     let (common, scatters): (Vec<Imperfection>, Vec<Imperfection>) = rows.partition(|row| row.measure == Measure::Mean);
-    let off = Imperfection::told(&common).map(|large| format!("{THROUGHOUT}: {large}"));
+    let off = Imperfection::told(&common).map(|told| format!("{THROUGHOUT}: {told}"));
     // these are no missing physics, and a consistent recording's sentence begins with them
     if verdict == Verdict::Consistent && !(said.is_empty() && off.is_none()) {
         said.push(format!("besides, {text}"));
