@@ -410,33 +410,31 @@ impl Text<'_> {
         }
         // what is wrong elsewhere is found by the strict reading
         let Ok(Probe { machine, lattice }) = toml::from_str(self.text) else { return Ok(()) };
-        let refuse = |key, expected: &str, found: &str| {
-            Err(RecordingError::Machine(self.key(key).mismatch(format!("{expected:?}"), format!("{found:?}"))))
-        };
         if let Some(toml::Value::String(name)) = machine
             && !begins(&ring.name, &name)
         {
-            return refuse("machine", &ring.name, &name);
+            return self.other_machine("machine", format!("{:?}", ring.name), format!("{name:?}"));
         }
         if let Some(toml::Value::String(file)) = lattice
             && file != ring.file
         {
-            return refuse("lattice", &ring.file, &file);
+            return self.other_machine("lattice", format!("{:?}", ring.file), format!("{file:?}"));
         }
         Ok(())
     }
 
     /// Particle and energy have to be the ring's.
     fn check_machine(&self, header: &Header, ring: &Ring) -> Result<(), RecordingError> {
-        let refuse = |key, expected: &dyn fmt::Display, found: &dyn fmt::Display| {
-            Err(RecordingError::Machine(self.key(key).mismatch(expected, found)))
-        };
         if header.particle != ring.particle.name() {
-            return refuse("particle", &format!("{:?}", ring.particle.name()), &format!("{:?}", header.particle));
+            return self.other_machine(
+                "particle",
+                format!("{:?}", ring.particle.name()),
+                format!("{:?}", header.particle),
+            );
         }
         let (expected, found) = (ring.particle.kinetic_energy, header.kinetic_energy);
         if (found / expected - 1.0).abs() > SAME_ENERGY {
-            return refuse("kinetic_energy_GeV", &expected, &found);
+            return self.other_machine("kinetic_energy_GeV", expected, found);
         }
         Ok(())
     }
@@ -498,6 +496,16 @@ impl Text<'_> {
 
     fn refuse_key(&self, key: &str, message: &str) -> RecordingError {
         RecordingError::Header(self.key(key), message.to_owned())
+    }
+
+    /// The value of a key is that of another machine.
+    fn other_machine(
+        &self,
+        key: &str,
+        expected: impl fmt::Display,
+        found: impl fmt::Display,
+    ) -> Result<(), RecordingError> {
+        Err(RecordingError::Machine(self.key(key).mismatch(expected, found)))
     }
 
     /// Where a key of the top level stands.
