@@ -144,6 +144,11 @@ pub fn imitating(library: f64) -> f64 {
 /// Probability below which an alternative that was not refitted is not listed.
 const LISTED: f64 = 1e-4;
 
+/// `ln` posterior weight below which one is not listed beside others, nothing (0) among them.
+pub(super) fn least_weight(others: &[(Alternative, f64)]) -> f64 {
+    others.iter().map(|(_, weight)| *weight).fold(0.0, f64::max) + LISTED.ln()
+}
+
 /// Alternatives with their probabilities, and nothing as one of them.
 pub(super) struct Weighed {
     /// Most likely first; those of negligible probability are left out.

@@ -39,15 +39,15 @@ const DEPENDENT: f64 = 1e-8;
 /// Highest power of the position that a monitor's reading may contain.
 const POWERS: usize = 5;
 
-/// Try every place in turn.
+/// Try every place in turn; those with a `ln` Bayes factor below `least` are of no account.
 ///
 /// # Errors
 /// [`FitError`].
-pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
+pub fn scan(data: &Data, fitted: &Fitted, least: f64) -> Result<Vec<Discrepancy>, FitError> {
     let data = fitted.data(data);
     let mut all = Vec::new();
     for campaign in 0..data.count() {
-        let of_one = scan_of(data, campaign, fitted)?;
+        let of_one = scan_of(data, campaign, fitted, least)?;
         // each recording has free amplitudes of its own
         all.extend(of_one.into_iter().map(|one| Discrepancy { campaign, sites: one.sites * data.count(), ..one }));
     }
@@ -55,9 +55,9 @@ pub fn scan(data: &Data, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> 
 }
 
 /// Every place in one of several recordings.
-fn scan_of(all: &Data, campaign: usize, fitted: &Fitted) -> Result<Vec<Discrepancy>, FitError> {
+fn scan_of(all: &Data, campaign: usize, fitted: &Fitted, least: f64) -> Result<Vec<Discrepancy>, FitError> {
     let data = all.campaign(campaign);
-    let linearised = Linearised::from_fit(fitted);
+    let linearised = Linearised::from_fit(fitted, least);
     let whitened = Seen::from_fit(fitted, all.parts().swap_remove(campaign));
     let settings = &data.settings;
     let monitors = data.monitors();
@@ -232,7 +232,7 @@ mod tests {
         let (ring, recording) = template();
         let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
-        let (linearised, settings) = (Linearised::from_fit(&fitted), &data.settings);
+        let (linearised, settings) = (Linearised::from_fit(&fitted, 0.0), &data.settings);
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
         let seen = seen_of(&data, &fitted);
         let sums = monitors.map(|b| data.sums(b, &seen, &settings.indicator()));
@@ -277,7 +277,7 @@ mod tests {
         let data = Data::from_campaign(&Campaign::of(&ring, &noise.campaign(&ring, &recording, &[])).unwrap()).unwrap();
         assert!(data.noise.momentum.value > 0.0 && data.noise.crates.len() == 1 && !data.noise.slow.is_none());
         let fitted = Fitted::from_guess(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
-        let (linearised, seen) = (Linearised::from_fit(&fitted), seen_of(&data, &fitted));
+        let (linearised, seen) = (Linearised::from_fit(&fitted, 0.0), seen_of(&data, &fitted));
         let own = Seen::from_fit(&fitted, 0..fitted.residual.len());
         let columns_of = |pattern: &DVector<f64>, indicator: &DMatrix<f64>| {
             let readings = DMatrix::from_fn(data.pools.count, pattern.len(), |_, b| pattern[b]);

@@ -21,7 +21,7 @@ use core::cell::Cell;
 use nalgebra::DVector;
 use twin::Ring;
 
-use super::alternatives::{Alternative, Competition};
+use super::alternatives::{Alternative, Competition, least_weight};
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::element::Element;
@@ -305,7 +305,8 @@ impl Search {
             weights.push((alternative, weight));
         }
         relearn(data, fitted, &mut weights, &outstanding);
-        for discrepancy in discrepancy::scan(data, fitted)? {
+        // the prior takes away from each
+        for discrepancy in discrepancy::scan(data, fitted, least_weight(&weights))? {
             let prior = (UNMODELLED_SEEN * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;
             weights.push((Alternative::unmodelled(discrepancy), weight));

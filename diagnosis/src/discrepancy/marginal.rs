@@ -35,7 +35,7 @@ pub struct Adapted {
 
 /// Standard deviations tried [m].
 pub const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
-/// `ln` Bayes factor above which the fit's unknowns are adapted.
+/// `ln` Bayes factor below which what the fit's unknowns would adapt is no more than their errors.
 const ASKED: f64 = 3.0;
 /// Share of a Gram matrix' mean diagonal by which rounding may move its eigenvalues.
 const SLACK: f64 = 1e-9;
@@ -44,11 +44,14 @@ pub struct Linearised<'f> {
     pub fitted: &'f Fitted,
     /// `L^-1 (J^T r - u)`.
     pub slope: DVector<f64>,
+    /// `ln` Bayes factor from which a place may count, so that the fit's unknowns are adapted.
+    asked: f64,
 }
 
 impl<'f> Linearised<'f> {
-    pub fn from_fit(fitted: &'f Fitted) -> Self {
-        Self { fitted, slope: fitted.free.whiten(&fitted.slope) }
+    /// `least`: `ln` Bayes factor below which a place is of no account.
+    pub fn from_fit(fitted: &'f Fitted, least: f64) -> Self {
+        Self { fitted, slope: fitted.free.whiten(&fitted.slope), asked: least.max(ASKED) }
     }
 
     /// Projected pull and Gram matrix of some amplitudes.
@@ -114,7 +117,7 @@ impl<'f> Linearised<'f> {
         // nothing gains more than all that the fit leaves
         let possible = |log: f64| if log <= 0.5 * self.fitted.cost { log } else { f64::NEG_INFINITY };
         let found = Discrepancy::averaged(at, logs.map(possible), sites);
-        let adapted = (found.log_bayes > ASKED).then(|| self.adapted(each, found.size)).flatten();
+        let adapted = (found.log_bayes > self.asked).then(|| self.adapted(each, found.size)).flatten();
         Discrepancy { adapted, ..found }
     }
 

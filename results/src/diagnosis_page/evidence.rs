@@ -22,7 +22,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
         let place = names.join(", ");
         Ranked { label: format!("{kind} {place}"), group: 0, value: candidate.log_bayes, threshold: Some(correction) }
     });
-    let discrepancies = scan_discrepancies(data, null)?;
+    let discrepancies = scan_discrepancies(data, null, f64::INFINITY)?;
     let sites = discrepancies.len();
     let unmodelled = discrepancies.iter().map(|one| {
         let label = format!("unmodelled: {}", one.at.short(data));
