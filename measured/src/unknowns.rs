@@ -11,7 +11,7 @@ pub enum Kind {
     Skew(usize),
     /// Integrated gradient of each magnet of a group beside its own [1/m].
     Gradient(usize),
-    /// Integrated vertical focusing in the middle of a straight [1/m], as of a wiggler.
+    /// Integrated vertical focusing of half a straight [1/m], as of a wiggler.
     Wiggler(usize),
     /// Gradient of each magnet of a group beside its own, which is 0 or nearly so, all along it [1/m^2].
     Added(usize),
@@ -97,7 +97,7 @@ pub struct Widths {
     pub strength: f64,
     /// Of an integrated skew gradient, and of an integrated gradient where the lattice has none [1/m].
     pub skew: f64,
-    /// Of the integrated vertical focusing of a straight [1/m].
+    /// Of the integrated vertical focusing of half a straight [1/m].
     pub wiggler: f64,
     /// Of the gain of a monitor and of a corrector.
     pub gain: f64,
@@ -147,7 +147,9 @@ fn cut<'r>(folder: &'r Folder, rows: &'r [usize]) -> impl Iterator<Item = &'r [u
     rows.chunk_by(is_one)
 }
 
-/// Rows of every straight in which a wiggler may stand, a metre and more of field-free rows: those of the name that the middle has.
+/// Rows of both halves of every straight in which a wiggler may stand, a metre and more of field-free rows: those of the name that the middle has. What focuses along
+/// a straight acts as its sum and its centre do, which need not be in the middle: a wiggler of 0.4 /m whose poles are 5 cm off would otherwise change the
+/// quadrupoles on both sides by half a per cent.
 pub fn straights(folder: &Folder) -> Vec<Magnets> {
     let is_free = |row: usize| {
         let Row { k1, bend, half_k2, .. } = folder.lattice[row];
@@ -158,15 +160,15 @@ pub fn straights(folder: &Folder) -> Vec<Magnets> {
     // the ring may begin within a straight
     let around: Vec<usize> = (first..count).chain(0..first).filter(|&row| folder.lattice[row].length > 0.0).collect();
     let length = |rows: &[usize]| rows.iter().map(|&row| folder.lattice[row].length).sum::<f64>();
-    let device = |rows: &[usize]| {
+    let halves = |rows: &[usize]| {
         let middle = (1..rows.len()).find(|&end| length(&rows[..end]) > 0.5 * length(rows)).unwrap_or(1) - 1;
         let name = |place: usize| &folder.lattice[rows[place]].name;
         let begin = (0..middle).rev().find(|&place| name(place) != name(middle)).map_or(0, |before| before + 1);
         let end = (middle..rows.len()).find(|&place| name(place) != name(middle)).unwrap_or(rows.len());
-        rows[begin..end].to_vec()
+        [&rows[begin..middle], &rows[middle..end]].map(<[usize]>::to_vec)
     };
     let free = around.chunk_by(|&one, &next| is_free(one) == is_free(next)).filter(|rows| is_free(rows[0]));
-    free.filter(|rows| length(rows) > STRAIGHT).map(device).collect()
+    free.filter(|rows| length(rows) > STRAIGHT).flat_map(halves).filter(|half| !half.is_empty()).collect()
 }
 
 /// What is fitted of a group of gradients: a factor, or a gradient that is added where the lattice has none, or less than a magnet without one may have.
