@@ -20,7 +20,7 @@ use crate::model::{Model, Prediction};
 use crate::noise::Noise;
 use crate::normal::{Places, times};
 use crate::uncertainty::Uncertainty;
-use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
+use crate::unknowns::{Focusing, Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
 
 /// Linearisations at most: the first begins at the fit, whose values differ from the last ones by what families take.
 const ROUNDS: usize = 10;
@@ -200,7 +200,7 @@ impl Hierarchy {
         start.settle(&model, ROUNDS, progress)
     }
 
-    /// The same with some members released, linearised anew.
+    /// The same with some members released, linearised anew; what focuses along a straight has its centre anywhere.
     ///
     /// # Errors
     /// [`MeasuredError`].
@@ -212,7 +212,9 @@ impl Hierarchy {
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
         let ordinary = self.families.iter().find(|family| family.is_learnt()).map_or(ORDINARY, |one| one.ordinary);
-        let mut families = families(folder, &self.groups, &self.unknowns, released, ordinary);
+        let released: Vec<usize> =
+            (0..self.unknowns.len()).filter(|&number| self.is_beside(number, released)).collect();
+        let mut families = families(folder, &self.groups, &self.unknowns, &released, ordinary);
         for family in &mut families {
             let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
             let Some(known) = known else { continue };
@@ -221,6 +223,12 @@ impl Hierarchy {
         let Self { data, groups, unknowns, values, classes, noise, .. } = self;
         let start = Start { data, groups, unknowns, values, classes, families, noise };
         start.settle(model, ROUNDS / 2, progress)
+    }
+
+    /// True of what is released, and of a moment where the wiggler in its straight is.
+    fn is_beside(&self, number: usize, released: &[usize]) -> bool {
+        let Kind::Moment(_, straight) = self.unknowns[number].kind else { return released.contains(&number) };
+        released.iter().any(|&other| self.unknowns[other].kind == Kind::Wiggler(straight))
     }
 
     /// Of another measurement of the same ring: changes about the values of this one, which are small beforehand.
@@ -518,8 +526,14 @@ fn all_unknowns(folder: &Folder, groups: &Groups, settings: &Settings) -> Vec<Un
     let fitted = unknowns(folder, groups, true, &settings.widths);
     let (magnets, instruments) = fitted.split_at(groups[0].len() + groups[1].len());
     let gradients = (0..groups[2].len()).map(|group| Unknown { kind: Kind::Gradient(group), mean: 0.0, width: skew });
-    let wigglers = (0..groups[3].len()).map(|group| Unknown { kind: Kind::Wiggler(group), mean: 0.0, width: wiggler });
-    magnets.iter().copied().chain(gradients).chain(wigglers).chain(instruments.iter().copied()).collect()
+    let straights = || 0..groups[3].len();
+    let wigglers = straights().map(|group| Unknown { kind: Kind::Wiggler(group), mean: 0.0, width: wiggler });
+    // as of the width of a gradient, a metre off the middle
+    let moments = [Focusing::Gradient, Focusing::Wiggler].into_iter().flat_map(|focusing| {
+        straights().map(move |group| Unknown { kind: Kind::Moment(focusing, group), mean: 0.0, width: skew })
+    });
+    let along = gradients.chain(wigglers).chain(moments);
+    magnets.iter().copied().chain(along).chain(instruments.iter().copied()).collect()
 }
 
 #[cfg(test)]

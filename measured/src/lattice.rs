@@ -17,19 +17,21 @@ use crate::unknowns::{Magnets, groups};
 /// `1/gamma` where no energy is stated: its square is below a thousandth of any ring's momentum compaction.
 const ULTRA_RELATIVISTIC: f64 = 1e-4;
 
-/// Thin lenses of a wiggler: its focusing spread over its length.
-pub const LENSES: usize = 5;
+/// Thin lenses along a straight, each a pair: a gradient and one that focuses vertically.
+const LENSES: usize = 5;
+/// Types of the two, as in a machine file.
+const PAIR: [&str; 2] = ["multipole", "wiggler"];
 
-/// The ring, with a thin element, a gradient of either kind, in the middle of some rows, and lenses along those of wigglers.
+/// The ring, with a thin element, a gradient of either kind, in the middle of some rows, and lenses along straights.
 ///
 /// # Errors
 /// [`MeasuredError::Lattice`].
-pub fn ring(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Result<Ring, MeasuredError> {
-    Ok(Ring::parse(&machine(folder, cut, wigglers).to_string(), &folder.name)?)
+pub fn ring(folder: &Folder, cut: &[usize], straights: &[Magnets]) -> Result<Ring, MeasuredError> {
+    Ok(Ring::parse(&machine(folder, cut, straights).to_string(), &folder.name)?)
 }
 
 /// The same as a machine file, docs/machine.md.
-pub fn machine(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Value {
+pub fn machine(folder: &Folder, cut: &[usize], straights: &[Magnets]) -> Value {
     let mut elements = Vec::new();
     let fitted: BTreeSet<usize> = groups(folder)[0].iter().flatten().copied().collect();
     for (row, one) in folder.lattice.iter().enumerate() {
@@ -52,7 +54,7 @@ pub fn machine(folder: &Folder, cut: &[usize], wigglers: &[Magnets]) -> Value {
             elements.push(json!({"name": own, "type": kind, "plane": plane, "label": name, "s_start": s, "length": 0}));
         }
     }
-    elements.extend(wigglers.iter().flat_map(|rows| lenses(folder, rows)));
+    elements.extend(straights.iter().flat_map(|rows| lenses(folder, rows)));
     let s = |one: &Value| one["s_start"].as_f64().unwrap_or(0.0);
     elements.sort_by(|a, b| s(a).total_cmp(&s(b)));
     let rest = folder.meta.particle.rest_energy();
@@ -85,21 +87,26 @@ pub fn parts(name: &str, has_skew: bool) -> (Vec<String>, Option<String>) {
     }
 }
 
-/// Names of the thin lenses that make the focusing of a wiggler.
-pub fn lens_names(folder: &Folder, rows: &[usize]) -> impl Iterator<Item = String> {
+/// Thin lenses along rows that follow each other: names of a pair, and its distance from the middle [m].
+pub fn lens_pairs(folder: &Folder, rows: &[usize]) -> Vec<([String; 2], f64)> {
     let name = folder.element(rows[0]);
-    (0..LENSES).map(move |lens| format!("{name} lens {lens}"))
+    let length: f64 = rows.iter().map(|&row| folder.lattice[row].length).sum();
+    let pair = |lens: usize| {
+        let off = ((lens as f64 + 0.5) / LENSES as f64 - 0.5) * length;
+        (PAIR.map(|one| format!("{name} {one} {lens}")), off)
+    };
+    (0..LENSES).map(pair).collect()
 }
 
-/// Thin lenses along rows that follow each other, which may go on at the start of the ring.
-fn lenses(folder: &Folder, rows: &[usize]) -> Vec<Value> {
+/// The same as elements; they may go on at the start of the ring.
+fn lenses(folder: &Folder, rows: &[usize]) -> impl Iterator<Item = Value> {
     let length: f64 = rows.iter().map(|&row| folder.lattice[row].length).sum();
-    let place = |lens: usize| {
-        let along = (lens as f64 + 0.5) / LENSES as f64 * length;
-        (folder.lattice[rows[0]].s + along) % folder.meta.circumference
-    };
-    let lens = |(lens, name): (usize, String)| json!({"name": name, "label": name, "type": "wiggler", "s_start": place(lens), "length": 0});
-    lens_names(folder, rows).enumerate().map(lens).collect()
+    let (middle, circumference) = (folder.lattice[rows[0]].s + 0.5 * length, folder.meta.circumference);
+    lens_pairs(folder, rows).into_iter().flat_map(move |(names, off)| {
+        let s = (middle + off) % circumference;
+        let lens = |(name, kind)| json!({"name": name, "label": name, "type": kind, "s_start": s, "length": 0});
+        names.into_iter().zip(PAIR).map(lens).collect::<Vec<_>>()
+    })
 }
 
 /// With a thin gradient in its middle, and with a gradient of its own that is fitted: a factor, or one that is added where there is none.

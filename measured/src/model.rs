@@ -13,8 +13,8 @@ use twin::{Hold, Kind as Field, LatticeError, Observer, Optics, Plane, Rf, Ring,
 use crate::derivative::{ByMachine, Change, Share};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
-use crate::lattice::{LENSES, lens_names, parts, ring, winding};
-use crate::unknowns::{Groups, Kind, Unknown};
+use crate::lattice::{lens_pairs, parts, ring, winding};
+use crate::unknowns::{Focusing, Groups, Kind, Unknown};
 
 /// Millimetres a metre.
 const MILLI: f64 = 1e3;
@@ -31,13 +31,25 @@ pub struct Model {
     strengths: Vec<Vec<usize>>,
     skews: Vec<Vec<usize>>,
     gradients: Vec<Vec<usize>>,
-    wigglers: Vec<Vec<usize>>,
+    /// Lenses along each straight.
+    straights: Vec<Vec<Pair>>,
     /// Element of each monitor's row, with the plane.
     monitors: Vec<(usize, Plane)>,
     /// Elements along which each corrector kicks, with their shares of the kick, and the plane.
     correctors: Vec<(Vec<(usize, f64)>, Plane)>,
     /// Kicks as believed [mrad].
     kicks: Vec<f64>,
+}
+
+/// Two lenses at one place of a straight.
+#[derive(Debug, Clone, Copy)]
+struct Pair {
+    /// Element that focuses as a gradient does.
+    gradient: usize,
+    /// Element that focuses vertically.
+    wiggler: usize,
+    /// Distance from the middle of the straight [m].
+    off: f64,
 }
 
 /// A predicted matrix and its derivatives.
@@ -79,8 +91,11 @@ impl Model {
         };
         let skews = groups[1].iter().map(thin).collect::<Result<_, _>>()?;
         let gradients = groups[2].iter().map(thin).collect::<Result<_, _>>()?;
-        let lenses = |rows: &Vec<usize>| lens_names(folder, rows).map(|name| ring.element(&name)).collect();
-        let wigglers = groups[3].iter().map(lenses).collect::<Result<_, LatticeError>>()?;
+        let pair = |([gradient, wiggler], off): ([String; 2], f64)| {
+            Ok(Pair { gradient: ring.element(&gradient)?, wiggler: ring.element(&wiggler)?, off })
+        };
+        let lenses = |rows: &Vec<usize>| lens_pairs(folder, rows).into_iter().map(pair).collect();
+        let straights = groups[3].iter().map(lenses).collect::<Result<_, LatticeError>>()?;
         let place = |kind: &str, at: usize| ring.element(&format!("{kind} {}", folder.element(at)));
         let monitors = folder.monitors.iter().map(|one| Ok((place("bpm", one.at)?, one.plane)));
         let correctors = folder.correctors.iter().map(|one| {
@@ -106,7 +121,7 @@ impl Model {
             strengths,
             skews,
             gradients,
-            wigglers,
+            straights,
             monitors,
             correctors,
             kicks,
@@ -145,9 +160,13 @@ impl Model {
                         }
                     }
                 }
-                Kind::Wiggler(group) => {
-                    for &element in &self.wigglers[group] {
-                        ring.elements[element].kind = Field::Wiggler { focusing: value / LENSES as f64 };
+                Kind::Wiggler(_) | Kind::Moment(..) => {
+                    for (element, _, share) in self.along(unknown.kind) {
+                        match &mut ring.elements[element].kind {
+                            Field::Wiggler { focusing } => *focusing += share * value,
+                            Field::Multipole { k1l, .. } => *k1l += share * value,
+                            _ => {}
+                        }
                     }
                 }
                 _ => {}
@@ -269,8 +288,35 @@ impl Model {
         });
         let skews = self.skews.iter().map(|group| each(group, Change::Skew, 1.0));
         let gradients = self.gradients.iter().map(|group| each(group, Change::Normal, 1.0));
-        let wigglers = self.wigglers.iter().map(|group| each(group, Change::Vertical, 1.0 / LENSES as f64));
-        strengths.chain(skews).chain(gradients).chain(wigglers).collect()
+        let straights = || 0..self.straights.len();
+        let moments = [Focusing::Gradient, Focusing::Wiggler];
+        let moments = moments.into_iter().flat_map(|one| straights().map(move |group| Kind::Moment(one, group)));
+        let along = straights().map(Kind::Wiggler).chain(moments).map(|kind| self.along(kind));
+        strengths.chain(skews).chain(gradients).chain(along).collect()
+    }
+
+    /// What an unknown changes along its straight: all lenses alike, or in proportion to their distances `s` from the middle, `s / sum of s^2` for a
+    /// moment of 1; nothing of any other unknown.
+    fn along(&self, kind: Kind) -> Vec<Share> {
+        let moment = |pairs: &[Pair]| {
+            let squares: f64 = pairs.iter().map(|pair| pair.off * pair.off).sum();
+            pairs.iter().map(|pair| (*pair, pair.off / squares)).collect::<Vec<_>>()
+        };
+        match kind {
+            Kind::Wiggler(group) => {
+                let pairs = &self.straights[group];
+                pairs.iter().map(|pair| (pair.wiggler, Change::Vertical, 1.0 / pairs.len() as f64)).collect()
+            }
+            Kind::Moment(Focusing::Wiggler, group) => {
+                let along = moment(&self.straights[group]).into_iter();
+                along.map(|(pair, share)| (pair.wiggler, Change::Vertical, share)).collect()
+            }
+            Kind::Moment(Focusing::Gradient, group) => {
+                let along = moment(&self.straights[group]).into_iter();
+                along.map(|(pair, share)| (pair.gradient, Change::Normal, share)).collect()
+            }
+            _ => Vec::new(),
+        }
     }
 
     /// A matrix with the dispersion as its last column, if it was measured.
@@ -299,7 +345,12 @@ impl Model {
                 Kind::CorrectorCoupling(column) => all.correctors[column][1] = value,
                 Kind::RfScale => all.rf = value,
                 Kind::HeldFrequency => all.held_frequency = Some(value),
-                Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => {}
+                Kind::Strength(_)
+                | Kind::Added(_)
+                | Kind::Skew(_)
+                | Kind::Gradient(_)
+                | Kind::Wiggler(_)
+                | Kind::Moment(..) => {}
             }
         }
         all
@@ -362,6 +413,28 @@ mod tests {
         }
     }
 
+    /// What focuses along a straight has the sum and the first moment that its unknowns are.
+    #[test]
+    fn unknowns_of_a_straight_are_its_moments() {
+        let folder = ring();
+        let [strengths, skews, ..] = crate::unknowns::groups(&folder);
+        let groups = [strengths, skews, Vec::new(), crate::unknowns::straights(&folder)];
+        let model = Model::of(&folder, &groups, Rf::FixedFrequency).unwrap();
+        assert!(model.straights.len() > 4, "{}", model.straights.len());
+        for (group, pairs) in model.straights.iter().enumerate() {
+            let moments = |kind: Kind| {
+                let shares = model.along(kind).into_iter().zip(pairs);
+                shares.fold([0.0; 2], |[sum, first], ((_, _, share), pair)| [sum + share, first + share * pair.off])
+            };
+            let along =
+                [Kind::Wiggler(group), Kind::Moment(Focusing::Gradient, group), Kind::Moment(Focusing::Wiggler, group)];
+            for (kind, expected) in along.into_iter().zip([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]) {
+                let found = moments(kind);
+                assert!((0..2).all(|order| (found[order] - expected[order]).abs() < 1e-12), "{kind:?}: {found:?}");
+            }
+        }
+    }
+
     #[test]
     fn derivatives_are_those_of_differences() {
         let mut folder = ring_with_winding();
@@ -373,16 +446,16 @@ mod tests {
         // a further gradient and a skew gradient in a dipole and in a quadrupole
         let [strengths, skews, ..] = crate::unknowns::groups(&folder);
         let place = strengths.len() + skews.len();
-        let model =
-            Model::of(&folder, &[strengths, skews, vec![vec![4], vec![2]], Vec::new()], Rf::FixedFrequency).unwrap();
-        for group in [1, 0] {
-            unknowns.insert(place, Unknown { kind: Kind::Gradient(group), mean: 0.0, width: 0.01 });
+        // and what focuses along a straight
+        let straight = crate::unknowns::straights(&folder).swap_remove(0);
+        let groups = [strengths, skews, vec![vec![4], vec![2]], vec![straight]];
+        let model = Model::of(&folder, &groups, Rf::FixedFrequency).unwrap();
+        let along = [Kind::Wiggler(0), Kind::Moment(Focusing::Gradient, 0), Kind::Moment(Focusing::Wiggler, 0)];
+        for kind in [Kind::Gradient(0), Kind::Gradient(1)].into_iter().chain(along).rev() {
+            unknowns.insert(place, Unknown { kind, mean: 0.0, width: 0.01 });
             values = values.insert_row(place, 0.004);
         }
-        let magnets = unknowns
-            .iter()
-            .filter(|one| matches!(one.kind, Kind::Strength(_) | Kind::Added(_) | Kind::Skew(_) | Kind::Gradient(_)))
-            .count();
+        let magnets = unknowns.iter().filter(|one| one.kind.is_of_machine()).count();
         // between the two holds both count
         unknowns.insert(magnets, Unknown { kind: Kind::HeldFrequency, mean: 1.0, width: 1.0 });
         let values = values.insert_row(magnets, 0.4);

@@ -31,6 +31,7 @@ impl Places {
                 | Kind::Skew(_)
                 | Kind::Gradient(_)
                 | Kind::Wiggler(_)
+                | Kind::Moment(..)
                 | Kind::HeldFrequency => places.machine += 1,
                 Kind::MonitorGain(row) => places.rows[row][0] = Some(at),
                 Kind::MonitorCoupling(row) => places.rows[row][1] = Some(at),

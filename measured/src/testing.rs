@@ -102,7 +102,12 @@ pub fn machine(folder: &Folder, seed: u64) -> (Model, Vec<Unknown>, DVector<f64>
         Kind::Skew(_) => 0.002,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) => 0.03,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.01,
-        Kind::Gradient(_) | Kind::Added(_) | Kind::Wiggler(_) | Kind::RfScale | Kind::HeldFrequency => 0.0,
+        Kind::Gradient(_)
+        | Kind::Added(_)
+        | Kind::Wiggler(_)
+        | Kind::Moment(..)
+        | Kind::RfScale
+        | Kind::HeldFrequency => 0.0,
     };
     let values = all.iter().map(|one| one.mean + size(one.kind) * normal());
     let values = DVector::from_iterator(all.len(), values);

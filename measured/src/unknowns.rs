@@ -11,8 +11,10 @@ pub enum Kind {
     Skew(usize),
     /// Integrated gradient of each magnet of a group beside its own [1/m].
     Gradient(usize),
-    /// Integrated vertical focusing of half a straight [1/m], as of a wiggler.
+    /// Integrated vertical focusing along a straight [1/m], as of a wiggler.
     Wiggler(usize),
+    /// First moment of what focuses along a straight about its middle: the integral of the gradient [1/m^2] times the distance [m].
+    Moment(Focusing, usize),
     /// Gradient of each magnet of a group beside its own, which is 0 or nearly so, all along it [1/m^2].
     Added(usize),
     /// Share of the orbit that a held RF frequency adds, 1 where it is held and 0 where the momentum is.
@@ -29,6 +31,15 @@ pub enum Kind {
     RfScale,
 }
 
+/// What focuses along a straight.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Focusing {
+    /// A gradient, in both planes.
+    Gradient,
+    /// A wiggler, vertically.
+    Wiggler,
+}
+
 impl Kind {
     /// Its word in results.
     pub fn word(self) -> &'static str {
@@ -37,6 +48,8 @@ impl Kind {
             Self::Skew(_) => "skew_gradient",
             Self::Gradient(_) => "stray_gradient",
             Self::Wiggler(_) => "wiggler_focusing",
+            Self::Moment(Focusing::Gradient, _) => "gradient_moment",
+            Self::Moment(Focusing::Wiggler, _) => "wiggler_moment",
             Self::Added(_) => "added_gradient",
             Self::HeldFrequency => "fixed_rf_frequency",
             Self::MonitorGain(_) => "bpm_gain",
@@ -55,6 +68,7 @@ impl Kind {
             | Self::Skew(_)
             | Self::Gradient(_)
             | Self::Wiggler(_)
+            | Self::Moment(..)
             | Self::HeldFrequency => true,
             Self::MonitorGain(_)
             | Self::MonitorCoupling(_)
@@ -87,7 +101,7 @@ const STRAIGHT: f64 = 1.0;
 /// Magnets that share one factor: rows of the lattice.
 pub type Magnets = Vec<usize>;
 
-/// Groups of gradients, of skew gradients, of gradients beside those of the lattice, and places of vertical focusing.
+/// Groups of gradients, of skew gradients, of gradients beside those of the lattice, and straights that may focus along their length.
 pub type Groups = [Vec<Magnets>; 4];
 
 /// Prior standard deviations.
@@ -97,7 +111,7 @@ pub struct Widths {
     pub strength: f64,
     /// Of an integrated skew gradient, and of an integrated gradient where the lattice has none [1/m].
     pub skew: f64,
-    /// Of the integrated vertical focusing of half a straight [1/m].
+    /// Of the integrated vertical focusing of a straight [1/m].
     pub wiggler: f64,
     /// Of the gain of a monitor and of a corrector.
     pub gain: f64,
@@ -147,9 +161,7 @@ fn cut<'r>(folder: &'r Folder, rows: &'r [usize]) -> impl Iterator<Item = &'r [u
     rows.chunk_by(is_one)
 }
 
-/// Rows of both halves of every straight in which a wiggler may stand, a metre and more of field-free rows: those of the name that the middle has. What focuses along
-/// a straight acts as its sum and its centre do, which need not be in the middle: a wiggler of 0.4 /m whose poles are 5 cm off would otherwise change the
-/// quadrupoles on both sides by half a per cent.
+/// Rows of every straight in which a wiggler may stand, a metre and more of field-free rows: those of the name that the middle has.
 pub fn straights(folder: &Folder) -> Vec<Magnets> {
     let is_free = |row: usize| {
         let Row { k1, bend, half_k2, .. } = folder.lattice[row];
@@ -160,15 +172,15 @@ pub fn straights(folder: &Folder) -> Vec<Magnets> {
     // the ring may begin within a straight
     let around: Vec<usize> = (first..count).chain(0..first).filter(|&row| folder.lattice[row].length > 0.0).collect();
     let length = |rows: &[usize]| rows.iter().map(|&row| folder.lattice[row].length).sum::<f64>();
-    let halves = |rows: &[usize]| {
+    let device = |rows: &[usize]| {
         let middle = (1..rows.len()).find(|&end| length(&rows[..end]) > 0.5 * length(rows)).unwrap_or(1) - 1;
         let name = |place: usize| &folder.lattice[rows[place]].name;
         let begin = (0..middle).rev().find(|&place| name(place) != name(middle)).map_or(0, |before| before + 1);
         let end = (middle..rows.len()).find(|&place| name(place) != name(middle)).unwrap_or(rows.len());
-        [&rows[begin..middle], &rows[middle..end]].map(<[usize]>::to_vec)
+        rows[begin..end].to_vec()
     };
     let free = around.chunk_by(|&one, &next| is_free(one) == is_free(next)).filter(|rows| is_free(rows[0]));
-    free.filter(|rows| length(rows) > STRAIGHT).flat_map(halves).filter(|half| !half.is_empty()).collect()
+    free.filter(|rows| length(rows) > STRAIGHT).map(device).collect()
 }
 
 /// What is fitted of a group of gradients: a factor, or a gradient that is added where the lattice has none, or less than a magnet without one may have.
@@ -232,7 +244,7 @@ pub fn name(folder: &Folder, groups: &Groups, kind: Kind) -> String {
         Kind::Added(group) => folder.element(groups[0][group][0]),
         Kind::Skew(group) => folder.element(groups[1][group][0]),
         Kind::Gradient(group) => folder.element(groups[2][group][0]),
-        Kind::Wiggler(group) => folder.element(groups[3][group][groups[3][group].len() / 2]),
+        Kind::Wiggler(group) | Kind::Moment(_, group) => folder.element(groups[3][group][groups[3][group].len() / 2]),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => folder.monitor(row),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => folder.corrector(column),
         Kind::RfScale | Kind::HeldFrequency => "RF".into(),
