@@ -284,23 +284,30 @@ impl Search {
         let mut leaders = self.leaders(data, fitted, &scanned)?;
         leaders.extend((0..scanned.len()).filter(|&i| outstanding.contains(&scanned[i].term)));
         let mut weights: Vec<(Alternative, f64)> = Vec::new();
-        let mut least = f64::INFINITY;
-        for (i, candidate) in scanned.iter().enumerate() {
-            if fitted.hypothesis.holds(&candidate.term, &data.ring) {
-                continue;
-            }
-            let known = present.as_ref().filter(|present| present.term() == Some(&candidate.term));
-            let alternative = match leaders.contains(&i) {
-                true => refit(data, fitted, candidate, least),
-                false => Alternative::from_candidate(candidate),
+        // the costs of drifting baselines are of other numbers
+        let cost = |one: &Alternative| {
+            let is_comparable = one.term().is_some_and(|term| !term.kind.moves_baselines());
+            one.fitted.as_ref().filter(|_| is_comparable).map_or(f64::INFINITY, |fitted| fitted.cost)
+        };
+        let mut least = present.as_ref().map_or(f64::INFINITY, cost);
+        // the best first, beside which fits of the others are abandoned
+        let mut order: Vec<usize> = (0..scanned.len()).collect();
+        order.retain(|&i| !fitted.hypothesis.holds(&scanned[i].term, &data.ring));
+        order.sort_by(|&one, &other| scanned[other].log_bayes.total_cmp(&scanned[one].log_bayes));
+        for i in order {
+            let candidate = &scanned[i];
+            let alternative = match present.as_ref().filter(|present| present.term() == Some(&candidate.term)) {
+                // it has been fitted to readings that are linearised about it
+                Some(known) if data.is_about_effects => known.clone(),
+                known => {
+                    let again = match leaders.contains(&i) {
+                        true => refit(data, fitted, candidate, least),
+                        false => Alternative::from_candidate(candidate),
+                    };
+                    known.filter(|known| known.log_gain > again.log_gain).cloned().unwrap_or(again)
+                }
             };
-            // it has been fitted to readings that are linearised about it
-            let better = known.filter(|known| data.is_about_effects || known.log_gain > alternative.log_gain).cloned();
-            let alternative = better.unwrap_or(alternative);
-            // the costs of drifting baselines are of other numbers
-            if let Some(fitted) = alternative.fitted.as_ref().filter(|_| !candidate.term.kind.moves_baselines()) {
-                least = least.min(fitted.cost);
-            }
+            least = least.min(cost(&alternative));
             let weight = alternative.log_gain + prior_of(i);
             weights.push((alternative, weight));
         }
