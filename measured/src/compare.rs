@@ -202,8 +202,10 @@ fn is_told_alone(changed: &Hierarchy, number: usize) -> bool {
         Kind::RfScale | Kind::Wiggler(_) | Kind::Added(_) => true,
         _ => false,
     };
-    let is_clear = |(change, sigma): (f64, f64)| change.abs() > clear(changed.unknowns.len()) * sigma;
-    is_alone && is_clear(change(changed, number))
+    // beside what those of its kind change where nothing was changed
+    let ordinary = changed.family_of(number).map_or(0.0, |family| family.variance().sqrt());
+    let (change, sigma) = change(changed, number);
+    is_alone && change.abs() > clear(changed.unknowns.len()) * sigma.hypot(ordinary * changed.unknowns[number].width)
 }
 
 /// Change of an unknown beside its family, with its standard deviation: of gains by a share of themselves, the common scale of their plane tells nothing.
