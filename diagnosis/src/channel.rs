@@ -10,7 +10,7 @@ use nalgebra::{DMatrix, DMatrixViewMut, DVector, DVectorViewMut};
 
 use super::levels::Levels;
 use super::memory::Memory;
-use evidence::solve_lower_mut;
+use evidence::Factor;
 
 /// A monitor's or a tune's readings.
 #[derive(Debug, Clone)]
@@ -33,7 +33,7 @@ pub struct Channel {
 enum Root {
     /// White noise: the roots of the numbers of readings, of such as have the ordinary level.
     White(DVector<f64>),
-    /// The lower factor of a regular covariance.
+    /// The inverse of the lower factor of a regular covariance: many columns are whitened by it.
     Remembers(DMatrix<f64>),
 }
 
@@ -65,20 +65,20 @@ impl Root {
                 covariance[(i, j)] = mean(&frames[i], &frames[j]);
             }
         }
-        Some(Self::Remembers(covariance.cholesky()?.unpack()))
+        Some(Self::Remembers(Factor::of(covariance)?.inverse_lower()))
     }
 
     fn whiten(&self, mut columns: DMatrixViewMut<f64>) {
         match self {
             Self::White(roots) => columns.column_iter_mut().for_each(|mut column| column.component_mul_assign(roots)),
-            Self::Remembers(lower) => solve_lower_mut(lower, columns),
+            Self::Remembers(inverse) => columns.copy_from(&(inverse * &columns)),
         }
     }
 
     fn log_det(&self) -> f64 {
         match self {
             Self::White(roots) => -2.0 * roots.iter().map(|root| root.ln()).sum::<f64>(),
-            Self::Remembers(lower) => 2.0 * lower.diagonal().iter().map(|d| d.ln()).sum::<f64>(),
+            Self::Remembers(inverse) => -2.0 * inverse.diagonal().iter().map(|d| d.ln()).sum::<f64>(),
         }
     }
 }
@@ -152,7 +152,7 @@ impl Channel {
     pub fn noise_of_means(&self) -> DVector<f64> {
         match &self.root {
             Root::White(roots) => roots.map(f64::recip),
-            Root::Remembers(lower) => lower.diagonal(),
+            Root::Remembers(inverse) => inverse.diagonal().map(f64::recip),
         }
     }
 
@@ -160,7 +160,7 @@ impl Channel {
     pub fn readings(&self) -> DVector<f64> {
         match &self.root {
             Root::White(roots) => roots.map(|root| root * root),
-            Root::Remembers(lower) => DVector::from_element(lower.nrows(), 1.0),
+            Root::Remembers(inverse) => DVector::from_element(inverse.nrows(), 1.0),
         }
     }
 }

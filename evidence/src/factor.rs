@@ -91,17 +91,12 @@ impl Factor {
     }
 
     /// `L^-1`.
-    fn inverse_lower(&self) -> DMatrix<f64> {
+    pub fn inverse_lower(&self) -> DMatrix<f64> {
         let n = self.lower.nrows();
         let mut inverse = DMatrix::identity(n, n);
         invert(self.lower.as_view(), inverse.as_view_mut());
         inverse
     }
-}
-
-/// `L^-1 B` in place of `B`, with the lower triangle of a regular `lower`; what stands above its diagonal is not read.
-pub fn solve_lower_mut(lower: &DMatrix<f64>, right: DMatrixViewMut<f64>) {
-    forward(lower.as_view(), right);
 }
 
 /// `A^T A`.

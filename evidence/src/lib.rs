@@ -28,5 +28,5 @@ mod factor;
 mod joint;
 
 pub use amplitude::{Evidence, log_bayes_factor_of_alike};
-pub use factor::{Factor, gram, solve_lower_mut, symmetric};
+pub use factor::{Factor, gram, symmetric};
 pub use joint::{JointEvidence, log_bayes_factor};
