@@ -212,8 +212,7 @@ impl Hierarchy {
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
         let ordinary = self.families.iter().find(|family| family.is_learnt()).map_or(ORDINARY, |one| one.ordinary);
-        let released: Vec<usize> =
-            (0..self.unknowns.len()).filter(|&number| self.is_beside(number, released)).collect();
+        let released: Vec<usize> = (0..self.unknowns.len()).filter(|&number| self.is_freed(number, released)).collect();
         let mut families = families(folder, &self.groups, &self.unknowns, &released, ordinary);
         for family in &mut families {
             let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
@@ -226,7 +225,7 @@ impl Hierarchy {
     }
 
     /// True of what is released, and of a moment where the wiggler in its straight is.
-    fn is_beside(&self, number: usize, released: &[usize]) -> bool {
+    fn is_freed(&self, number: usize, released: &[usize]) -> bool {
         let Kind::Moment(_, straight) = self.unknowns[number].kind else { return released.contains(&number) };
         released.iter().any(|&other| self.unknowns[other].kind == Kind::Wiggler(straight))
     }

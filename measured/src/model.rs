@@ -298,25 +298,19 @@ impl Model {
     /// What an unknown changes along its straight: all lenses alike, or in proportion to their distances `s` from the middle, `s / sum of s^2` for a
     /// moment of 1; nothing of any other unknown.
     fn along(&self, kind: Kind) -> Vec<Share> {
-        let moment = |pairs: &[Pair]| {
-            let squares: f64 = pairs.iter().map(|pair| pair.off * pair.off).sum();
-            pairs.iter().map(|pair| (*pair, pair.off / squares)).collect::<Vec<_>>()
+        let (group, change) = match kind {
+            Kind::Wiggler(group) | Kind::Moment(Focusing::Wiggler, group) => (group, Change::Vertical),
+            Kind::Moment(Focusing::Gradient, group) => (group, Change::Normal),
+            _ => return Vec::new(),
         };
-        match kind {
-            Kind::Wiggler(group) => {
-                let pairs = &self.straights[group];
-                pairs.iter().map(|pair| (pair.wiggler, Change::Vertical, 1.0 / pairs.len() as f64)).collect()
-            }
-            Kind::Moment(Focusing::Wiggler, group) => {
-                let along = moment(&self.straights[group]).into_iter();
-                along.map(|(pair, share)| (pair.wiggler, Change::Vertical, share)).collect()
-            }
-            Kind::Moment(Focusing::Gradient, group) => {
-                let along = moment(&self.straights[group]).into_iter();
-                along.map(|(pair, share)| (pair.gradient, Change::Normal, share)).collect()
-            }
-            _ => Vec::new(),
-        }
+        let pairs = &self.straights[group];
+        let squares: f64 = pairs.iter().map(|pair| pair.off * pair.off).sum();
+        let share = |pair: &Pair| match kind {
+            Kind::Moment(..) => pair.off / squares,
+            _ => 1.0 / pairs.len() as f64,
+        };
+        let element = |pair: &Pair| if change == Change::Normal { pair.gradient } else { pair.wiggler };
+        pairs.iter().map(|pair| (element(pair), change, share(pair))).collect()
     }
 
     /// A matrix with the dispersion as its last column, if it was measured.
