@@ -4,9 +4,7 @@ use nalgebra::DMatrix;
 use twin::Plane;
 
 use crate::folder::{Flags, Folder};
-use crate::missed::Missed;
 use crate::model::Prediction;
-use crate::noise::Noise;
 
 /// Monitors' plane and correctors' plane, or the dispersion in a plane.
 pub const BLOCKS: [&str; 6] = ["x to H", "x to V", "y to H", "y to V", "x to RF", "y to RF"];
@@ -80,49 +78,6 @@ impl Data {
     /// One over the square of the stated noise of each element [1/mm^2].
     pub fn stated(&self) -> DMatrix<f64> {
         self.sigma.map(|sigma| sigma.powi(-2))
-    }
-
-    /// The same with the errors of the elements.
-    pub fn precision(&self, noise: &Noise) -> DMatrix<f64> {
-        self.each(noise, |block, sigma, _| block.spread(sigma).powi(-2), None)
-    }
-
-    /// What each element counts [1/mm^2], the less the further it is off.
-    pub fn weight(&self, noise: &Noise, residual: &DMatrix<f64>) -> DMatrix<f64> {
-        self.each(noise, Missed::weight, Some(residual))
-    }
-
-    /// What each element says on average [1/mm^2].
-    pub fn information(&self, noise: &Noise) -> DMatrix<f64> {
-        self.each(noise, |block, sigma, _| block.information(sigma), None)
-    }
-
-    /// `ln` of the likelihood of residuals [mm].
-    pub fn log_likelihood(&self, noise: &Noise, residual: &DMatrix<f64>) -> f64 {
-        let elements = (0..residual.ncols()).flat_map(|column| (0..residual.nrows()).map(move |row| (row, column)));
-        let counted = elements.filter(|&at| self.sigma[at].is_finite());
-        counted.map(|at| self.log_density(noise, at, residual[at])).sum()
-    }
-
-    /// The same of the residual [mm] of one element.
-    pub fn log_density(&self, noise: &Noise, at: (usize, usize), residual: f64) -> f64 {
-        let scale = noise.monitors[at.0];
-        noise.blocks[self.block[at]].log_likelihood(self.sigma[at], residual / scale) - scale.ln()
-    }
-
-    /// A precision of each element, from one of its block at the residual in units of its monitor's scale.
-    fn each(
-        &self,
-        noise: &Noise,
-        precision: impl Fn(&Missed, f64, f64) -> f64,
-        residual: Option<&DMatrix<f64>>,
-    ) -> DMatrix<f64> {
-        let (rows, columns) = self.sigma.shape();
-        DMatrix::from_fn(rows, columns, |row, column| {
-            let (at, scale) = ((row, column), noise.monitors[row]);
-            let residual = residual.map_or(0.0, |residual| residual[at] / scale);
-            precision(&noise.blocks[self.block[at]], self.sigma[at], residual) / (scale * scale)
-        })
     }
 
     /// Sum of squares over the stated noise.

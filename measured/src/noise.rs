@@ -135,6 +135,51 @@ struct Own {
     gain: f64,
 }
 
+impl Data {
+    /// One over the square of the error of each element [1/mm^2].
+    pub fn precision(&self, noise: &Noise) -> DMatrix<f64> {
+        self.each(noise, |block, sigma, _| block.spread(sigma).powi(-2), None)
+    }
+
+    /// What each element counts [1/mm^2], the less the further it is off.
+    pub fn weight(&self, noise: &Noise, residual: &DMatrix<f64>) -> DMatrix<f64> {
+        self.each(noise, Missed::weight, Some(residual))
+    }
+
+    /// What each element says on average [1/mm^2].
+    pub fn information(&self, noise: &Noise) -> DMatrix<f64> {
+        self.each(noise, |block, sigma, _| block.information(sigma), None)
+    }
+
+    /// `ln` of the likelihood of residuals [mm].
+    pub fn log_likelihood(&self, noise: &Noise, residual: &DMatrix<f64>) -> f64 {
+        let elements = (0..residual.ncols()).flat_map(|column| (0..residual.nrows()).map(move |row| (row, column)));
+        let counted = elements.filter(|&at| self.sigma[at].is_finite());
+        counted.map(|at| self.log_density(noise, at, residual[at])).sum()
+    }
+
+    /// The same of the residual [mm] of one element.
+    pub fn log_density(&self, noise: &Noise, at: (usize, usize), residual: f64) -> f64 {
+        let scale = noise.monitors[at.0];
+        noise.blocks[self.block[at]].log_likelihood(self.sigma[at], residual / scale) - scale.ln()
+    }
+
+    /// A precision of each element, from one of its block at the residual in units of its monitor's scale.
+    fn each(
+        &self,
+        noise: &Noise,
+        precision: impl Fn(&Missed, f64, f64) -> f64,
+        residual: Option<&DMatrix<f64>>,
+    ) -> DMatrix<f64> {
+        let (rows, columns) = self.sigma.shape();
+        DMatrix::from_fn(rows, columns, |row, column| {
+            let (at, scale) = ((row, column), noise.monitors[row]);
+            let residual = residual.map_or(0.0, |residual| residual[at] / scale);
+            precision(&noise.blocks[self.block[at]], self.sigma[at], residual) / (scale * scale)
+        })
+    }
+}
+
 /// Block, stated noise [mm] and error [mm] of a monitor's elements that count.
 fn elements<'d>(data: &'d Data, errors: &'d DMatrix<f64>, row: usize) -> impl Iterator<Item = (usize, f64, f64)> + 'd {
     let columns = (0..errors.ncols()).filter(move |&column| data.sigma[(row, column)].is_finite());
