@@ -1,11 +1,8 @@
-//! What drove the beam in the frames of a campaign, and the linear optics of the machine that it drove.
+//! What drove the beam in the frames of a campaign, and where linear optics put it.
 
 use nalgebra::{DMatrix, DVector};
 
-use super::machine::Machine;
-use crate::lattice::{Plane, Ring};
-use crate::orbit::{Hold, OrbitError};
-use crate::response::Optics;
+use crate::lattice::Ring;
 use crate::tune::Tunes;
 
 /// What drove the beam in the frames of a campaign, in the order of time, and the orbit that the kicks were added to.
@@ -29,35 +26,6 @@ pub(super) struct Seen {
     pub response: [DMatrix<f64>; 2],
     /// Tunes.
     pub tunes: Tunes,
-}
-
-impl Machine {
-    /// Kicks that the frames really had.
-    pub(super) fn kicks(&self, drives: &Drives) -> DMatrix<f64> {
-        let mut kick = drives.kick.clone();
-        self.correctors.iter().for_each(|one| one.of_frames(&mut kick, drives.nominal_kick));
-        kick
-    }
-
-    /// Linear optics of a ring that holds what this machine holds.
-    pub(super) fn seen(&self, ring: &Ring) -> Result<Seen, OrbitError> {
-        self.seen_by(ring, &Optics::of(ring, Hold::Momentum { delta: self.hold.delta })?)
-    }
-
-    /// The same, given the ring's optics at this momentum.
-    pub(super) fn seen_by(&self, ring: &Ring, optics: &Optics) -> Result<Seen, OrbitError> {
-        let held = self.held_of(ring, optics)?;
-        let sources = optics.correctors();
-        let with_rf = |plane: Plane| {
-            let places = optics.monitor_places(plane);
-            let response = held.response(optics, &places, &sources);
-            let at = response.ncols();
-            let mut all = response.insert_column(at, 0.0);
-            all.set_column(at, &held.rf_response(optics, &places));
-            all
-        };
-        Ok(Seen { response: [Plane::X, Plane::Y].map(with_rf), tunes: optics.tunes()? })
-    }
 }
 
 impl Ring {

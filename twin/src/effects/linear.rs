@@ -12,9 +12,10 @@
 use nalgebra::{DMatrix, MatrixXx2};
 
 use super::drift;
-use super::drives::Drives;
+use super::drives::{Drives, Seen};
 use super::field::Crossed;
 use super::machine::Machine;
+use crate::lattice::{Plane, Ring};
 use crate::orbit::{Hold, OrbitError};
 use crate::response::Optics;
 use crate::tune::Tunes;
@@ -46,6 +47,33 @@ impl Machine {
         let mut base: Vec<[f64; 2]> = self.ring.monitors.iter().map(|monitor| drives.orbit[monitor.element]).collect();
         self.monitors.iter().for_each(|reading| reading.of_changes(&self.ring, &mut base, &mut positions));
         Ok((self.ring.own_planes(&positions), seen.tunes, tune_changes))
+    }
+
+    /// Kicks that the frames really had.
+    pub(super) fn kicks(&self, drives: &Drives) -> DMatrix<f64> {
+        let mut kick = drives.kick.clone();
+        self.correctors.iter().for_each(|one| one.of_frames(&mut kick, drives.nominal_kick));
+        kick
+    }
+
+    /// Linear optics of a ring that holds what this machine holds.
+    pub(super) fn seen(&self, ring: &Ring) -> Result<Seen, OrbitError> {
+        self.seen_by(ring, &Optics::of(ring, Hold::Momentum { delta: self.hold.delta })?)
+    }
+
+    /// The same, given the ring's optics at this momentum.
+    pub(super) fn seen_by(&self, ring: &Ring, optics: &Optics) -> Result<Seen, OrbitError> {
+        let held = self.held_of(ring, optics)?;
+        let sources = optics.correctors();
+        let with_rf = |plane: Plane| {
+            let places = optics.monitor_places(plane);
+            let response = held.response(optics, &places, &sources);
+            let at = response.ncols();
+            let mut all = response.insert_column(at, 0.0);
+            all.set_column(at, &held.rf_response(optics, &places));
+            all
+        };
+        Ok(Seen { response: [Plane::X, Plane::Y].map(with_rf), tunes: optics.tunes()? })
     }
 }
 
