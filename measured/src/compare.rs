@@ -203,7 +203,7 @@ fn is_told_alone(changed: &Hierarchy, number: usize) -> bool {
         _ => false,
     };
     // beside what those of its kind change where nothing was changed
-    let ordinary = changed.family_of(number).map_or(0.0, |family| family.variance().sqrt());
+    let ordinary = changed.family_of(number).map_or(0.0, Family::ordinary_scatter);
     let (change, sigma) = change(changed, number);
     is_alone && change.abs() > clear(changed.unknowns.len()) * sigma.hypot(ordinary * changed.unknowns[number].width)
 }
