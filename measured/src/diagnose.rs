@@ -18,7 +18,7 @@ use crate::model::Model;
 use crate::normal::Places;
 use crate::search::{NAMED, Outlier, Rival, Search, search};
 use crate::straight::DEAD;
-use crate::unknowns::{Groups, Kind, name};
+use crate::unknowns::{self, Groups, Kind, name};
 use crate::wiring::Wiring;
 
 /// Searches, each about the fit with what the one before has found.
@@ -345,7 +345,7 @@ fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
         Kind::Strength(group) | Kind::Added(group) => middle(groups[0][group][0]),
         Kind::Skew(group) => middle(groups[1][group][0]),
         Kind::Gradient(group) => middle(groups[2][group][0]),
-        Kind::Wiggler(group) | Kind::Moment(_, group) => middle(groups[3][group][groups[3][group].len() / 2]),
+        Kind::Wiggler(group) | Kind::Moment(_, group) => middle(unknowns::middle(&groups[3][group])),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => middle(folder.monitors[row].at),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => middle(folder.correctors[column].at),
         Kind::RfScale | Kind::HeldFrequency => 0.0,

@@ -20,7 +20,7 @@ use crate::model::{Model, Prediction};
 use crate::noise::Noise;
 use crate::normal::{Places, times};
 use crate::uncertainty::Uncertainty;
-use crate::unknowns::{Focusing, Groups, Kind, Magnets, Unknown, Widths, magnets, straights, unknowns};
+use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, focusing_along, magnets, middle, straights, unknowns};
 
 /// Linearisations at most: the first begins at the fit, whose values differ from the last ones by what families take.
 const ROUNDS: usize = 10;
@@ -490,7 +490,7 @@ fn everything(folder: &Folder, fitted: &Groups) -> Groups {
     let [mut strengths, mut skews, mut gradients, _] = fitted.clone();
     let is_magnet = |row: &Row| row.k1 != 0.0 || row.bend != 0.0 || row.half_k2 != 0.0;
     for magnet in magnets(folder, is_magnet) {
-        let middle = vec![magnet[magnet.len() / 2]];
+        let middle = vec![middle(&magnet)];
         if !skews.iter().flatten().any(|row| magnet.contains(row)) {
             skews.push(middle.clone());
         }
@@ -501,7 +501,7 @@ fn everything(folder: &Folder, fitted: &Groups) -> Groups {
     let with_gradient = fitted[0].iter().filter(|group| group.iter().any(|&row| folder.lattice[row].k1 != 0.0));
     strengths.extend(in_common(folder, &with_gradient.cloned().collect::<Vec<_>>()));
     let straights = straights(folder);
-    gradients.extend(straights.iter().map(|rows| vec![rows[rows.len() / 2]]));
+    gradients.extend(straights.iter().map(|rows| vec![middle(rows)]));
     [strengths, skews, gradients, straights]
 }
 
@@ -525,14 +525,12 @@ fn all_unknowns(folder: &Folder, groups: &Groups, settings: &Settings) -> Vec<Un
     let fitted = unknowns(folder, groups, true, &settings.widths);
     let (magnets, instruments) = fitted.split_at(groups[0].len() + groups[1].len());
     let gradients = (0..groups[2].len()).map(|group| Unknown { kind: Kind::Gradient(group), mean: 0.0, width: skew });
-    let straights = || 0..groups[3].len();
-    let wigglers = straights().map(|group| Unknown { kind: Kind::Wiggler(group), mean: 0.0, width: wiggler });
-    // as of the width of a gradient, a metre off the middle
-    let moments = [Focusing::Gradient, Focusing::Wiggler].into_iter().flat_map(|focusing| {
-        straights().map(move |group| Unknown { kind: Kind::Moment(focusing, group), mean: 0.0, width: skew })
+    let along = focusing_along(groups[3].len()).map(|kind| {
+        // a moment is as wide as a gradient, a metre off the middle
+        let width = if matches!(kind, Kind::Wiggler(_)) { wiggler } else { skew };
+        Unknown { kind, mean: 0.0, width }
     });
-    let along = gradients.chain(wigglers).chain(moments);
-    magnets.iter().copied().chain(along).chain(instruments.iter().copied()).collect()
+    magnets.iter().copied().chain(gradients).chain(along).chain(instruments.iter().copied()).collect()
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use twin::{Plane, Ring};
 
 use crate::error::MeasuredError;
 use crate::folder::{Folder, Row};
-use crate::unknowns::{Magnets, groups};
+use crate::unknowns::{Magnets, groups, length};
 
 /// `1/gamma` where no energy is stated: its square is below a thousandth of any ring's momentum compaction.
 const ULTRA_RELATIVISTIC: f64 = 1e-4;
@@ -90,7 +90,7 @@ pub fn parts(name: &str, has_skew: bool) -> (Vec<String>, Option<String>) {
 /// Thin lenses along rows that follow each other: names of a pair, and its distance from the middle [m].
 pub fn lens_pairs(folder: &Folder, rows: &[usize]) -> Vec<([String; 2], f64)> {
     let name = folder.element(rows[0]);
-    let length: f64 = rows.iter().map(|&row| folder.lattice[row].length).sum();
+    let length = length(folder, rows);
     let pair = |lens: usize| {
         let off = ((lens as f64 + 0.5) / LENSES as f64 - 0.5) * length;
         (PAIR.map(|one| format!("{name} {one} {lens}")), off)
@@ -100,8 +100,7 @@ pub fn lens_pairs(folder: &Folder, rows: &[usize]) -> Vec<([String; 2], f64)> {
 
 /// The same as elements; they may go on at the start of the ring.
 fn lenses(folder: &Folder, rows: &[usize]) -> impl Iterator<Item = Value> {
-    let length: f64 = rows.iter().map(|&row| folder.lattice[row].length).sum();
-    let (middle, circumference) = (folder.lattice[rows[0]].s + 0.5 * length, folder.meta.circumference);
+    let (middle, circumference) = (folder.lattice[rows[0]].s + 0.5 * length(folder, rows), folder.meta.circumference);
     lens_pairs(folder, rows).into_iter().flat_map(move |(names, off)| {
         let s = (middle + off) % circumference;
         let lens = |(name, kind)| json!({"name": name, "label": name, "type": kind, "s_start": s, "length": 0});

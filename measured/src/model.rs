@@ -14,7 +14,7 @@ use crate::derivative::{ByMachine, Change, Share};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::lattice::{lens_pairs, parts, ring, winding};
-use crate::unknowns::{Focusing, Groups, Kind, Unknown};
+use crate::unknowns::{Focusing, Groups, Kind, Unknown, focusing_along};
 
 /// Millimetres a metre.
 const MILLI: f64 = 1e3;
@@ -279,19 +279,15 @@ impl Model {
 
     /// What each unknown of a magnet changes, with the gradients of the factors.
     fn changes(&self, gradients: &[Vec<f64>]) -> Vec<Vec<Share>> {
-        let each = |group: &Vec<usize>, change: Change, share: f64| -> Vec<Share> {
-            group.iter().map(|&at| (at, change, share)).collect()
-        };
+        let each =
+            |group: &Vec<usize>, change: Change| -> Vec<Share> { group.iter().map(|&at| (at, change, 1.0)).collect() };
         let strengths = self.strengths.iter().zip(gradients).map(|(group, gradients)| {
             let each = group.iter().zip(gradients);
             each.map(|(&at, &per_unit)| (at, Change::Normal, per_unit)).collect()
         });
-        let skews = self.skews.iter().map(|group| each(group, Change::Skew, 1.0));
-        let gradients = self.gradients.iter().map(|group| each(group, Change::Normal, 1.0));
-        let straights = || 0..self.straights.len();
-        let moments = [Focusing::Gradient, Focusing::Wiggler];
-        let moments = moments.into_iter().flat_map(|one| straights().map(move |group| Kind::Moment(one, group)));
-        let along = straights().map(Kind::Wiggler).chain(moments).map(|kind| self.along(kind));
+        let skews = self.skews.iter().map(|group| each(group, Change::Skew));
+        let gradients = self.gradients.iter().map(|group| each(group, Change::Normal));
+        let along = focusing_along(self.straights.len()).map(|kind| self.along(kind));
         strengths.chain(skews).chain(gradients).chain(along).collect()
     }
 

@@ -40,6 +40,16 @@ pub enum Focusing {
     Wiggler,
 }
 
+/// What is fitted along so many straights, in the order of the unknowns: vertical focusing, then moments.
+pub fn focusing_along(straights: usize) -> impl Iterator<Item = Kind> {
+    let kinds: [fn(usize) -> Kind; 3] = [
+        Kind::Wiggler,
+        |straight| Kind::Moment(Focusing::Gradient, straight),
+        |straight| Kind::Moment(Focusing::Wiggler, straight),
+    ];
+    kinds.into_iter().flat_map(move |kind| (0..straights).map(kind))
+}
+
 impl Kind {
     /// Its word in results.
     pub fn word(self) -> &'static str {
@@ -139,6 +149,16 @@ pub fn groups(folder: &Folder) -> Groups {
     [of(true), of(false), Vec::new(), Vec::new()]
 }
 
+/// Length of some rows together [m].
+pub fn length(folder: &Folder, rows: &[usize]) -> f64 {
+    rows.iter().map(|&row| folder.lattice[row].length).sum()
+}
+
+/// The row in the middle of some.
+pub fn middle(rows: &Magnets) -> usize {
+    rows[rows.len() / 2]
+}
+
 fn distinct(rows: &[usize]) -> Magnets {
     let mut rows = rows.to_vec();
     rows.sort_unstable();
@@ -171,7 +191,7 @@ pub fn straights(folder: &Folder) -> Vec<Magnets> {
     let Some(first) = (0..count).find(|&row| !is_free(row)) else { return Vec::new() };
     // the ring may begin within a straight
     let around: Vec<usize> = (first..count).chain(0..first).filter(|&row| folder.lattice[row].length > 0.0).collect();
-    let length = |rows: &[usize]| rows.iter().map(|&row| folder.lattice[row].length).sum::<f64>();
+    let length = |rows: &[usize]| length(folder, rows);
     let device = |rows: &[usize]| {
         let middle = (1..rows.len()).find(|&end| length(&rows[..end]) > 0.5 * length(rows)).unwrap_or(1) - 1;
         let name = |place: usize| &folder.lattice[rows[place]].name;
@@ -189,7 +209,7 @@ fn of_gradients(folder: &Folder, group: usize, rows: &Magnets, widths: &Widths) 
     if cut(folder, rows).any(|magnet| magnet.iter().map(integrated).sum::<f64>().abs() > widths.skew) {
         return Unknown { kind: Kind::Strength(group), mean: 1.0, width: widths.strength };
     }
-    let length = rows.iter().map(|&row| folder.lattice[row].length).sum::<f64>() / rows.len() as f64;
+    let length = length(folder, rows) / rows.len() as f64;
     Unknown { kind: Kind::Added(group), mean: 0.0, width: widths.skew / length }
 }
 
@@ -244,7 +264,7 @@ pub fn name(folder: &Folder, groups: &Groups, kind: Kind) -> String {
         Kind::Added(group) => folder.element(groups[0][group][0]),
         Kind::Skew(group) => folder.element(groups[1][group][0]),
         Kind::Gradient(group) => folder.element(groups[2][group][0]),
-        Kind::Wiggler(group) | Kind::Moment(_, group) => folder.element(groups[3][group][groups[3][group].len() / 2]),
+        Kind::Wiggler(group) | Kind::Moment(_, group) => folder.element(middle(&groups[3][group])),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => folder.monitor(row),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => folder.corrector(column),
         Kind::RfScale | Kind::HeldFrequency => "RF".into(),
