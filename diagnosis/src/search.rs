@@ -312,7 +312,7 @@ impl Search {
             weights.push((alternative, weight));
         }
         relearn(data, fitted, &mut weights, &outstanding);
-        // the prior takes away from each
+        // by its prior each weighs less than its evidence
         for discrepancy in discrepancy::scan(data, fitted, least_weight(&weights))? {
             let prior = (UNMODELLED_SEEN * odds / (SORTS * discrepancy.sites) as f64).ln();
             let weight = discrepancy.log_bayes + prior;

@@ -35,7 +35,7 @@ pub struct Adapted {
 
 /// Standard deviations tried [m].
 pub const SIZES: [f64; 8] = [20e-6, 40e-6, 80e-6, 160e-6, 320e-6, 640e-6, 1.28e-3, 2.56e-3];
-/// `ln` Bayes factor below which what the fit's unknowns would adapt is no more than their errors.
+/// `ln` Bayes factor above which the fit's unknowns are adapted.
 const ASKED: f64 = 3.0;
 /// Share of a Gram matrix' mean diagonal by which rounding may move its eigenvalues.
 const SLACK: f64 = 1e-9;
