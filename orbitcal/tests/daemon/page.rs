@@ -3,6 +3,7 @@
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
@@ -135,7 +136,14 @@ fn a_browser_shows_the_page_at_desk_and_phone_width() {
                 ]);
                 command.arg(format!("--user-data-dir={}", profile.path().display()));
                 command.arg(format!("--window-size={width},{height}")).args([what, &url]);
-                let output = command.output().unwrap();
+                // a browser that a signal ended, as some do at their first start, has shown nothing: it starts again
+                let mut output = command.output().unwrap();
+                for _ in 0..2 {
+                    if output.status.signal().is_some() {
+                        eprintln!("{}", told(&output));
+                        output = command.output().unwrap();
+                    }
+                }
                 assert!(output.status.success(), "{}", told(&output));
                 String::from_utf8_lossy(&output.stdout).into_owned()
             };
