@@ -199,3 +199,56 @@ fn common_energy(elements: &[Value]) -> Option<Value> {
     let first = stated.next()?;
     stated.all(|one| one == first).then(|| first.clone())
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::rngs::StdRng;
+    use rand::{RngExt, SeedableRng};
+
+    use super::*;
+
+    /// By pyAT, not compressed; by Octave, compressed.
+    const FILES: [&[u8]; 2] = [
+        include_bytes!("../../../recordings/measured/imports/twelve-cells.at.mat"),
+        include_bytes!("../../../recordings/measured/imports/twelve-cells.octave.mat"),
+    ];
+
+    fn parse(bytes: &[u8]) -> Result<(), MeasuredError> {
+        read(&MatFile::of("file", bytes.to_vec())?, None).map(drop)
+    }
+
+    #[test]
+    fn a_file_that_is_cut_off_is_refused() {
+        for bytes in FILES {
+            assert!(parse(bytes).is_ok());
+            for length in (0..bytes.len()).step_by(if bytes.len() > 10_000 { 101 } else { 1 }) {
+                assert!(parse(&bytes[..length]).is_err(), "{length}");
+            }
+        }
+    }
+
+    #[test]
+    fn no_byte_makes_it_panic() {
+        let mut random = StdRng::seed_from_u64(5);
+        for bytes in FILES {
+            for _ in 0..3000 {
+                let mut bytes = bytes.to_vec();
+                for _ in 0..random.random_range(1..4) {
+                    let at = random.random_range(116..bytes.len());
+                    bytes[at] = if random.random() { 0xff } else { random.random() };
+                }
+                drop(parse(&bytes));
+            }
+        }
+    }
+
+    #[test]
+    fn a_struct_of_more_elements_than_bytes_is_refused() {
+        let bytes = FILES[0];
+        // dimensions of the cell array: after the header and the tags of the variable, its flags and they themselves
+        let at = 128 + 8 + 16 + 8;
+        let mut bytes = bytes.to_vec();
+        bytes[at..at + 8].copy_from_slice(&[0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff, 0x7f]);
+        assert!(parse(&bytes).unwrap_err().to_string().contains("cut off"));
+    }
+}

@@ -10,10 +10,10 @@
 //!
 //! Source: `measrespmat.m` and `measbpmresp.m` of the Matlab Middle Layer.
 
-use super::conventions::{KickIs, Stated};
 use super::hdf5::Matrix;
 use super::instruments::Order;
-use super::mat::{Mat, Place};
+use super::mat::{Mat, MatFile, Place};
+use super::stated::{KickIs, Stated};
 use measured::MeasuredError;
 use twin::limits::MEMORY;
 
@@ -21,7 +21,7 @@ use twin::limits::MEMORY;
 const FIELDS: [&str; 3] = ["Data", "Monitor", "Actuator"];
 
 /// True of such a struct array.
-pub(super) fn is_one(value: &Mat) -> bool {
+fn is_one(value: &Mat) -> bool {
     let Mat::Structs(shape, names, values) = value else { return false };
     !values.is_empty()
         && shape.iter().all(|one| *one <= 2)
@@ -29,8 +29,27 @@ pub(super) fn is_one(value: &Mat) -> bool {
         && FIELDS.iter().all(|field| names.iter().any(|name| name == field))
 }
 
+/// The numbers of a variable as a matrix, and what the file says of them; without a name those of the only response matrix of the Matlab Middle Layer.
+pub(super) fn matrix(mat: &MatFile, name: Option<&str>) -> Result<(Matrix, Stated), MeasuredError> {
+    let refuse = |problem: String| MeasuredError::Table { file: mat.file.clone(), problem };
+    let mut responses = mat.variables.iter().filter(|(_, value)| is_one(value)).map(|(name, _)| name.as_str());
+    let only = responses.next().filter(|_| responses.next().is_none());
+    let Some(name) = name.or(only) else {
+        return Err(refuse(format!("name a variable, {}:NAME; it has {}", mat.file, mat.words())));
+    };
+    let place = mat.variable(name).ok_or_else(|| refuse(format!("no variable {name}; it has {}", mat.words())))?;
+    if is_one(place.value) {
+        return read(&place);
+    }
+    let (Some([lines, width]), values) = (place.shape(), place.numbers()?) else {
+        return Err(place.expected("a matrix"));
+    };
+    let line = |line: usize| values.iter().skip(line).step_by(lines);
+    Ok((Matrix { width, values: (0..lines).flat_map(line).copied().collect() }, Stated::default()))
+}
+
 /// Its blocks as one matrix, x before y and H before V, and what it says of them.
-pub(super) fn read(all: &Place) -> Result<(Matrix, Stated), MeasuredError> {
+fn read(all: &Place) -> Result<(Matrix, Stated), MeasuredError> {
     let Mat::Structs(shape, ..) = all.value else { return Err(all.expected("a struct")) };
     let block = |row: usize, column: usize| all.field_of(row + shape[0] * column, "Data");
     // of a plane that was not measured no block has a size
@@ -90,7 +109,6 @@ fn units(all: &Place, block: usize) -> Result<String, MeasuredError> {
 mod tests {
     use super::*;
     use crate::import::OrbitUnit;
-    use crate::import::mat::MatFile;
 
     /// Two monitors of x and one of y, one corrector of H and two of V; x to V was not measured.
     fn file(units: &str) -> MatFile {
@@ -118,7 +136,7 @@ mod tests {
     #[test]
     fn blocks_are_put_together_and_their_units_are_known() {
         for name in [Some("Rmat"), None] {
-            let (matrix, stated) = file("mm/Radian").matrix(name).unwrap();
+            let (matrix, stated) = matrix(&file("mm/Radian"), name).unwrap();
             assert_eq!(matrix.width, 3);
             let nan = f64::NAN;
             let expected = [1.0, nan, nan, 2.0, nan, nan, nan, 5.0, 6.0];
@@ -129,11 +147,11 @@ mod tests {
             );
         }
         // empty text is no text: those of monitor and actuator
-        let (_, stated) = file("").matrix(None).unwrap();
+        let (_, stated) = matrix(&file(""), None).unwrap();
         assert_eq!((stated.unit, stated.kick), (Some(OrbitUnit::Millimetres), None));
-        let said = file("V/Ampere").matrix(None).unwrap_err().to_string();
+        let said = matrix(&file("V/Ampere"), None).unwrap_err().to_string();
         assert_eq!(said, "resp.mat: Rmat: UnitsString: expected m, mm or um over the unit of a kick, found v/ampere");
-        let of_other = file("mm/Radian").matrix(Some("DCCT")).unwrap();
+        let of_other = matrix(&file("mm/Radian"), Some("DCCT")).unwrap();
         assert_eq!((of_other.0.values, of_other.1), (vec![500.0], Stated::default()));
     }
 
@@ -146,11 +164,12 @@ mod tests {
         values[1][0] = Mat::Numbers(vec![0, 0], Vec::new());
         values[0][3] = Mat::Numbers(vec![1, 1], vec![1e-5]);
         values[3][4] = Mat::Text("mm/Ampere".into());
-        let (matrix, stated) = file.matrix(None).unwrap();
+        let (matrix, stated) = matrix(&file, None).unwrap();
         assert_eq!((matrix.width, matrix.values, stated.kick), (1, vec![1.0, 2.0], Some(1e3)));
         let Mat::Structs(shape, _, values) = &mut file.variables[1].1 else { panic!("a struct") };
         values.truncate(1);
         *shape = vec![1, 1];
-        assert_eq!(file.matrix(None).unwrap().0.values, [1.0, 2.0]);
+        let (alone, _) = super::matrix(&file, None).unwrap();
+        assert_eq!(alone.values, [1.0, 2.0]);
     }
 }

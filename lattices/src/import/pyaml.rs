@@ -11,8 +11,8 @@
 
 use serde_json::Value;
 
-use super::conventions::{KickIs, OrbitUnit, Stated};
 use super::fields::Fields;
+use super::stated::{KickIs, OrbitUnit, Stated};
 use super::table::Table;
 use measured::MeasuredError;
 

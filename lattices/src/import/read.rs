@@ -1,11 +1,14 @@
-//! A lattice file, read by the format that its content shows.
+//! Files of lattices and of tables, read by the format that their content shows.
 
 use std::path::Path;
 
 use super::element::Lattice;
+use super::hdf5::{self, Matrix};
 use super::mat::MatFile;
 use super::source::{Source, bytes};
-use super::{at, at_mat, madx, pals, xsuite};
+use super::stated::Stated;
+use super::table::Table;
+use super::{at, at_mat, madx, mml, pals, pyaml, sdds, xsuite};
 use measured::MeasuredError;
 use twin::limits::{DEPTH, Document, ELEMENTS};
 
@@ -51,6 +54,43 @@ impl Lattice {
             let seen = keys.map_or_else(|| first_line(text), |keys| format!("the keys {keys}"));
             Err(unknown(file, &seen))
         }
+    }
+}
+
+impl Table {
+    /// Read a table of text, a dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`,
+    /// whose lines and columns have no names. A response matrix of the Matlab Middle Layer needs no `NAME`. Matrices of pyAML and of SDDS have names, and say their
+    /// units. An empty field or `nan` was not measured.
+    ///
+    /// # Errors
+    /// [`MeasuredError`], with file and line.
+    pub fn read(path: &Path) -> Result<Self, MeasuredError> {
+        let source = Source::of(path);
+        let file = source.path.display().to_string();
+        let bytes = bytes(&source.path)?;
+        if MatFile::is_one(&bytes) {
+            let (matrix, stated) = mml::matrix(&MatFile::of(&file, bytes)?, source.name.as_deref())?;
+            return Self::bare(path, matrix, stated);
+        }
+        if hdf5::is_one(&bytes) {
+            return Self::bare(path, hdf5::matrix(&source, bytes)?, Stated::default());
+        }
+        if sdds::is_one(&bytes) {
+            return sdds::read(&file, &bytes, source.name.as_deref());
+        }
+        match String::from_utf8(bytes) {
+            Ok(text) if pyaml::is_one(&text) => pyaml::read(&file, &document(&file, &text)?, source.name.as_deref()),
+            Ok(text) => Self::parse(&file, &text),
+            Err(_) => {
+                Err(MeasuredError::Table { file, problem: "expected a table of text, SDDS, HDF5 or a MAT-file".into() })
+            }
+        }
+    }
+
+    /// Numbers alone.
+    fn bare(path: &Path, Matrix { width, values }: Matrix, stated: Stated) -> Result<Self, MeasuredError> {
+        let lines = values.chunks(width.max(1)).map(|values| (None, values.to_vec())).collect();
+        Self::named(&path.display().to_string(), stated, None, lines)
     }
 }
 

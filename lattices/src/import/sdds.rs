@@ -11,7 +11,7 @@
 use core::str::FromStr;
 use std::collections::HashMap;
 
-use super::conventions::Stated;
+use super::stated::Stated;
 use super::table::Table;
 use measured::MeasuredError;
 use twin::limits::{Budget, MEMORY, TEXT};

@@ -1,17 +1,9 @@
-//! A plain table of numbers: separated by commas, semicolons, tabs or spaces, with names in the first line and in the first column or without; or a
-//! dataset of an HDF5 file, `FILE.h5:/PATH` or `FILE.h5:/X,/Y` for one below the other, or a variable of a MAT-file, `FILE.mat:NAME`, whose lines and columns have no names.
-//! A response matrix of the Matlab Middle Layer needs no `NAME`. Matrices of pyAML and of SDDS have names, and say their units.
+//! A table of numbers with names of its lines and columns, or without; in text they are separated by commas, semicolons, tabs or spaces.
 
 use std::collections::HashMap;
-use std::path::Path;
 
-use super::conventions::Stated;
-use super::hdf5::{self, Matrix};
 use super::instruments::{Channel, Instrument, Order, channel, in_order, label};
-use super::mat::MatFile;
-use super::read::document;
-use super::source::{Source, bytes};
-use super::{pyaml, sdds};
+use super::stated::Stated;
 use measured::MeasuredError;
 use twin::limits::{Budget, Exceeded, FINITE, MEMORY, TEXT};
 
@@ -35,39 +27,6 @@ struct Line {
 }
 
 impl Table {
-    /// Read it; an empty field or `nan` was not measured.
-    ///
-    /// # Errors
-    /// [`MeasuredError`], with file and line.
-    pub fn read(path: &Path) -> Result<Self, MeasuredError> {
-        let source = Source::of(path);
-        let file = source.path.display().to_string();
-        let bytes = bytes(&source.path)?;
-        if MatFile::is_one(&bytes) {
-            let (matrix, stated) = MatFile::of(&file, bytes)?.matrix(source.name.as_deref())?;
-            return Self::of(path, matrix, stated);
-        }
-        if hdf5::is_one(&bytes) {
-            return Self::of(path, hdf5::matrix(&source, bytes)?, Stated::default());
-        }
-        if sdds::is_one(&bytes) {
-            return sdds::read(&file, &bytes, source.name.as_deref());
-        }
-        match String::from_utf8(bytes) {
-            Ok(text) if pyaml::is_one(&text) => pyaml::read(&file, &document(&file, &text)?, source.name.as_deref()),
-            Ok(text) => Self::parse(&file, &text),
-            Err(_) => {
-                Err(MeasuredError::Table { file, problem: "expected a table of text, SDDS, HDF5 or a MAT-file".into() })
-            }
-        }
-    }
-
-    /// Numbers alone.
-    fn of(path: &Path, Matrix { width, values }: Matrix, stated: Stated) -> Result<Self, MeasuredError> {
-        let lines = values.chunks(width.max(1)).map(|values| (None, values.to_vec())).collect();
-        Self::named(&path.display().to_string(), stated, None, lines)
-    }
-
     /// Of names of columns, and lines with their names; a number that is NaN was not measured.
     pub(super) fn named(
         file: &str,
@@ -141,7 +100,7 @@ impl Table {
     /// Read the text of a table; `file` appears in errors.
     ///
     /// # Errors
-    /// As [`Table::read`].
+    /// [`MeasuredError::Table`], with file and line.
     pub fn parse(file: &str, text: &str) -> Result<Self, MeasuredError> {
         let mut table = Self { file: file.into(), stated: Stated::default(), columns: None, rows: Vec::new() };
         for (number, cells) in cells(file, text)? {

@@ -6,9 +6,6 @@ mod place;
 
 pub(super) use place::Place;
 
-use super::conventions::Stated;
-use super::hdf5::Matrix;
-use super::mml;
 use measured::MeasuredError;
 
 /// Dimensions of an array; the first runs fastest.
@@ -92,27 +89,6 @@ impl MatFile {
         Some(Place::of(&self.file, name, value))
     }
 
-    /// The numbers of a variable as a matrix, and what the file says of them; without a name those of the only response matrix of the Matlab Middle Layer.
-    pub fn matrix(&self, name: Option<&str>) -> Result<(Matrix, Stated), MeasuredError> {
-        let refuse = |problem: String| MeasuredError::Table { file: self.file.clone(), problem };
-        let mut responses =
-            self.variables.iter().filter(|(_, value)| mml::is_one(value)).map(|(name, _)| name.as_str());
-        let only = responses.next().filter(|_| responses.next().is_none());
-        let Some(name) = name.or(only) else {
-            return Err(refuse(format!("name a variable, {}:NAME; it has {}", self.file, self.words())));
-        };
-        let place =
-            self.variable(name).ok_or_else(|| refuse(format!("no variable {name}; it has {}", self.words())))?;
-        if mml::is_one(place.value) {
-            return mml::read(&place);
-        }
-        let (Some([lines, width]), values) = (place.shape(), place.numbers()?) else {
-            return Err(place.expected("a matrix"));
-        };
-        let line = |line: usize| values.iter().skip(line).step_by(lines);
-        Ok((Matrix { width, values: (0..lines).flat_map(line).copied().collect() }, Stated::default()))
-    }
-
     /// Names and kinds of the variables, for an error.
     pub fn words(&self) -> String {
         let all = self.variables.iter().take(12).map(|(name, value)| format!("{name} ({})", value.words()));
@@ -126,17 +102,6 @@ mod tests {
     use rand::{RngExt, SeedableRng};
 
     use super::*;
-    use crate::import::at_mat;
-
-    /// By pyAT, not compressed; by Octave, compressed.
-    const FILES: [&[u8]; 2] = [
-        include_bytes!("../../../../recordings/measured/imports/twelve-cells.at.mat"),
-        include_bytes!("../../../../recordings/measured/imports/twelve-cells.octave.mat"),
-    ];
-
-    fn read(bytes: &[u8]) -> Result<(), MeasuredError> {
-        at_mat::read(&MatFile::of("file", bytes.to_vec())?, None).map(drop)
-    }
 
     #[test]
     fn every_kind_of_value_of_octave_is_read() {
@@ -202,40 +167,5 @@ mod tests {
             second.places(3, "an element").unwrap_err().to_string(),
             "file: P(2).ElemIndex: number 1: expected an element, 1 to 3, found 4"
         );
-    }
-
-    #[test]
-    fn a_file_that_is_cut_off_is_refused() {
-        for bytes in FILES {
-            assert!(read(bytes).is_ok());
-            for length in (0..bytes.len()).step_by(if bytes.len() > 10_000 { 101 } else { 1 }) {
-                assert!(read(&bytes[..length]).is_err(), "{length}");
-            }
-        }
-    }
-
-    #[test]
-    fn no_byte_makes_it_panic() {
-        let mut random = StdRng::seed_from_u64(5);
-        for bytes in FILES {
-            for _ in 0..3000 {
-                let mut bytes = bytes.to_vec();
-                for _ in 0..random.random_range(1..4) {
-                    let at = random.random_range(116..bytes.len());
-                    bytes[at] = if random.random() { 0xff } else { random.random() };
-                }
-                drop(read(&bytes));
-            }
-        }
-    }
-
-    #[test]
-    fn a_struct_of_more_elements_than_bytes_is_refused() {
-        let bytes = FILES[0];
-        // dimensions of the cell array: after the header and the tags of the variable, its flags and they themselves
-        let at = 128 + 8 + 16 + 8;
-        let mut bytes = bytes.to_vec();
-        bytes[at..at + 8].copy_from_slice(&[0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff, 0x7f]);
-        assert!(read(&bytes).unwrap_err().to_string().contains("cut off"));
     }
 }
