@@ -11,7 +11,8 @@ Errors are those of the program `orbitcal`, with the same words: `InputError` fo
 from ._orbitcal import InputError, OrbitcalError, __version__
 from .estimator import Correction, Estimate, Estimator, Subscriber
 from .recording import Recording
-from .results import Change, Comparison, DiagnosisResult, Finding, FitResult, Monitor, Var
+from .records import Change, Finding, Monitor, Var
+from .results import Comparison, DiagnosisResult, FitResult
 from .ring import Ring
 from .work import compare, diagnose, fit, sample
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from .results import Change, Comparison, DiagnosisResult, Var
+    from .records import Change, Finding, Var
 
 COLOURS = ("#9aa5b1", "#1f5fa8")
 VARS = 3.2  # inches, height of a figure of vars
@@ -44,11 +44,9 @@ def of_vars(fits: dict[str, list[Var]], title: str) -> Drawn:
     return figure
 
 
-def of_diagnosis(result: DiagnosisResult) -> Drawn:
-    """Probabilities of the causes above, vars without and with them below."""
-    fits = {"without": result.vars_before, "with what was found": result.vars_after}
-    fits = {name: vars for name, vars in fits.items() if vars}
-    causes = [(one, other) for one in result.findings for other in (one, *one.alternatives)]
+def of_findings(findings: list[Finding], fits: dict[str, list[Var]], title: str) -> Drawn:
+    """Probabilities of the causes above, vars below, one colour a fit."""
+    causes = [(one, other) for one in findings for other in (one, *one.alternatives)]
     has_causes = any(cause.probability is not None for _, cause in causes)
     count = max((len(vars) for vars in fits.values()), default=12)
     heights = [0.7 + 0.3 * min(MOST, len(causes))] if has_causes else []
@@ -56,19 +54,19 @@ def of_diagnosis(result: DiagnosisResult) -> Drawn:
     if has_causes:
         _causes(axes[0], causes)
     _vars(axes[-1], fits)
-    axes[0].set_title(f"{result.recording}: {result.verdict}")
+    axes[0].set_title(title)
     return figure
 
 
-def of_changes(result: Comparison) -> Drawn:
+def of_changes(changes: list[Change]) -> Drawn:
     """Changes of the vars with their 68 % error bars; those too large for chance in colour."""
-    figure, (axes,) = _axes([VARS], len(result.changes))
+    figure, (axes,) = _axes([VARS], len(changes))
     for is_changed, colour, word in [(False, COLOURS[0], "within chance"), (True, COLOURS[1], "changed")]:
-        own = [(i, one) for i, one in enumerate(result.changes) if one.changed == is_changed]
+        own = [(i, one) for i, one in enumerate(changes) if one.changed == is_changed]
         if own:
             _bars(axes, own, colour, word)
     axes.axhline(0, color="black", linewidth=0.6)
-    _names(axes, [one.name for one in result.changes])
+    _names(axes, [one.name for one in changes])
     axes.set_ylabel("change / %")
     axes.legend(frameon=False)
     return figure

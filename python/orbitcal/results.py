@@ -16,81 +16,10 @@ import numpy as np
 import pandas as pd
 
 from . import figures
+from .records import Change, Finding, Monitor, Var, each, known
 
 if TYPE_CHECKING:
     from .figures import Drawn
-
-
-def _known(kind: type, values: dict[str, Any]) -> dict[str, Any]:
-    """Those of the values that are fields of a dataclass; the JSON may grow."""
-    names = {one.name for one in fields(kind)}
-    return {name: value for name, value in values.items() if name in names}
-
-
-def _each(kind: type, values: list[dict[str, Any]]) -> list[Any]:
-    return [kind(**_known(kind, one)) for one in values]
-
-
-@dataclass(frozen=True)
-class Var:
-    """A strength factor: mean, standard deviation and quantiles of its posterior [1]."""
-
-    name: str
-    mean: float
-    sigma: float
-    q025: float
-    q16: float
-    q84: float
-    q975: float
-    clipped: bool = False
-    index: int | None = None
-    """Row of lattice.csv, of a measured matrix."""
-
-
-@dataclass(frozen=True)
-class Monitor:
-    """State of a monitor: `ok`, `noisy`, `jumps` or `dead`; noise of one reading [mm]; readings that were not used."""
-
-    name: str
-    state: str
-    sigma_mm: float
-    rejected: int
-
-
-@dataclass(frozen=True)
-class Finding:
-    """An effect that the model lacks; amplitude and sigma in `unit`, evidence in nat."""
-
-    kind: str
-    at: str | None
-    amplitude: float
-    sigma: float
-    unit: str
-    sentence: str
-    s_m: float | None = None
-    log_evidence_gain: float | None = None
-    probability: float | None = None
-    heldout_gain: tuple[float, float] | None = None
-    chance: float | None = None
-    inseparable: bool = False
-    alternatives: list[Finding] = field(default_factory=list)
-
-    @classmethod
-    def of_json(cls, values: dict[str, Any]) -> Finding:
-        others = [cls.of_json(one) for one in values.get("alternatives", [])]
-        return cls(**{**_known(cls, values), "alternatives": others})
-
-
-@dataclass(frozen=True)
-class Change:
-    """Change of a strength factor from one recording to another, B over A minus 1, and its standard deviation [1]."""
-
-    name: str
-    relative: float
-    sigma: float
-    identifiable: bool
-    changed: bool = False
-    index: int | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -158,11 +87,11 @@ class FitResult(_Result):
         """From what the work came to."""
         values = json.loads(outcome.json)
         changed = {
-            "vars": _each(Var, values["vars"]),
-            "monitors": _each(Monitor, values["monitors"]),
+            "vars": each(Var, values["vars"]),
+            "monitors": each(Monitor, values["monitors"]),
             "tunes": _tunes(values.get("tunes")),
         }
-        return cls(outcome, **{**_known(cls, values), **changed})
+        return cls(outcome, **{**known(cls, values), **changed})
 
     @property
     def means(self) -> pd.Series:
@@ -211,12 +140,12 @@ class DiagnosisResult(_Result):
         values = json.loads(outcome.json)
         changed = {
             "findings": [Finding.of_json(one) for one in values["findings"]],
-            "monitors": _each(Monitor, values.get("monitors", [])),
-            "vars_before": _each(Var, values.get("vars_before", [])),
-            "vars_after": _each(Var, values.get("vars_after", [])),
+            "monitors": each(Monitor, values.get("monitors", [])),
+            "vars_before": each(Var, values.get("vars_before", [])),
+            "vars_after": each(Var, values.get("vars_after", [])),
             "tunes": _tunes(values.get("tunes")),
         }
-        return cls(outcome, **{**_known(cls, values), **changed})
+        return cls(outcome, **{**known(cls, values), **changed})
 
     @property
     def means(self) -> pd.Series:
@@ -237,7 +166,9 @@ class DiagnosisResult(_Result):
 
     def figure(self) -> Drawn:
         """Probabilities of what was found and of its alternatives, and the vars without and with it."""
-        return figures.of_diagnosis(self)
+        fits = {"without": self.vars_before, "with what was found": self.vars_after}
+        fits = {name: vars for name, vars in fits.items() if vars}
+        return figures.of_findings(self.findings, fits, f"{self.recording}: {self.verdict}")
 
 
 @dataclass(frozen=True, repr=False)
@@ -252,7 +183,7 @@ class Comparison(_Result):
     def of(cls, outcome: Any) -> Comparison:
         """From what the work came to."""
         values = json.loads(outcome.json)
-        return cls(outcome, **{**_known(cls, values), "changes": _each(Change, values["changes"])})
+        return cls(outcome, **{**known(cls, values), "changes": each(Change, values["changes"])})
 
     @property
     def table(self) -> pd.DataFrame:
@@ -261,7 +192,7 @@ class Comparison(_Result):
 
     def figure(self) -> Drawn:
         """The changes with their 68 % error bars."""
-        return figures.of_changes(self)
+        return figures.of_changes(self.changes)
 
 
 def _table(rows: list[Any]) -> pd.DataFrame:

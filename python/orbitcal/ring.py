@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     import at
     import xtrack
 
-    from .results import DiagnosisResult, Finding, FitResult
+    from .records import Finding
+    from .results import DiagnosisResult, FitResult
 
 Effect: TypeAlias = "str | Finding | Mapping[str, Any]"
 Patterns: TypeAlias = "str | Iterable[str]"
