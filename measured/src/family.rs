@@ -222,14 +222,14 @@ impl Family {
 
     /// `ln` probability of what the data say of the members, and of the scale beforehand; none where rounding leaves no positive curvature.
     pub fn log_evidence(&self, marginal: &Marginal) -> Option<f64> {
-        let prior = self.precision();
-        let whole = Factor::of(&(&prior + &marginal.information))?;
+        let whole = Factor::of(&(self.precision() + &marginal.information))?;
+        Some(self.log_prior()? - whole.log_root() + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope)))
+    }
+
+    /// `ln` of the root of the prior's determinant, and `ln` probability of the scale beforehand.
+    pub fn log_prior(&self) -> Option<f64> {
         let square = (self.ordinary / self.scale).powi(2);
-        Some(
-            Factor::of(&prior)?.log_root() - whole.log_root()
-                + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope))
-                + 0.5 * BEFOREHAND * (square.ln() - square),
-        )
+        Some(Factor::of(&self.precision())?.log_root() + 0.5 * BEFOREHAND * (square.ln() - square))
     }
 
     /// The same with another scale.
