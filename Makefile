@@ -99,7 +99,7 @@ network: setup ## the network on the emulated chip beside the host, bit for bit,
 	cargo test --locked --release -p system-tests --test network -- --nocapture
 
 measured: toolchain ## four measured rings beside LOCO's fits of them: the numbers of docs/real-rings.md; half an hour
-	cargo test --locked --release --workspace --test measured --test measured_diagnosis -- --include-ignored --nocapture --test-threads 2
+	cargo test --locked --release --workspace --test measured --test measured_changes --test measured_diagnosis -- --include-ignored --nocapture --test-threads 2
 
 figures: toolchain ## the figures of the worked case in docs/diagnosis.md, from the page of its recording
 	cargo run --locked --release -p results --example figures -- recordings/concealed/open-10 docs/figures what-was-found place-scan evidence
