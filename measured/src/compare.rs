@@ -272,6 +272,7 @@ fn gradients(folder: &Folder, before: &Hierarchy, changed: &Hierarchy) -> Vec<Ch
 mod tests {
     use super::*;
     use crate::testing::{NOISE, machine, measured, normal, ring};
+    use crate::unknowns::{Focusing, Unknown, straights};
 
     #[test]
     fn changes_are_found_within_their_error_bars_where_the_model_errs_alike() {
@@ -302,6 +303,30 @@ mod tests {
         // none of them changed, and a change of 0.1 % would show
         assert!(of("QD"), "{found:?}");
         assert!(found.iter().all(|one| one.sigma < 0.003), "{found:?}");
+    }
+
+    /// A wiggler of 0.2 /m whose poles are 3 cm off the middle of its straight: the quadrupoles on both sides are as they were.
+    #[test]
+    fn a_wiggler_off_the_middle_of_its_straight_is_no_quadrupole() {
+        let ring = ring();
+        let truth = machine(&ring, 5);
+        let before = measured(&ring, &truth, NOISE, 1);
+        let (_, mut unknowns, mut values) = truth;
+        let [strengths, skews, ..] = crate::unknowns::groups(&ring);
+        let (place, straight) = (strengths.len() + skews.len(), straights(&ring).swap_remove(3));
+        let groups = [strengths, skews, Vec::new(), vec![straight.clone()]];
+        let model = Model::of(&ring, &groups, twin::Rf::FixedFrequency).unwrap();
+        let along = [Kind::Wiggler(0), Kind::Moment(Focusing::Gradient, 0), Kind::Moment(Focusing::Wiggler, 0)];
+        for (kind, value) in along.into_iter().zip([0.2, 0.0, 0.006]).rev() {
+            unknowns.insert(place, Unknown { kind, mean: 0.0, width: 0.1 });
+            values = values.insert_row(place, value);
+        }
+        let after = measured(&ring, &(model, unknowns, values), NOISE, 2);
+        let found = compare(&before, &after, &Settings::default(), &mut |_| ()).unwrap().1;
+        let [only] = found.others.as_slice() else { panic!("{found:?}") };
+        assert!(only.word == "wiggler_focusing" && only.at == ring.element(straight[straight.len() / 2]), "{only:?}");
+        assert!((only.change - 0.2).abs() < 4.0 * only.sigma && only.sigma < 0.01, "{only:?}");
+        assert!(found.gradients.iter().all(|one| !one.has_changed), "{found:?}");
     }
 
     #[test]

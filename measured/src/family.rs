@@ -43,6 +43,8 @@ pub const ORDINARY: f64 = 0.1;
 /// The scale of changes of a ring in which nothing was changed: strengths 0.03 %, gains 0.2 %, gradients 0.0001 /m. With it, changes of strengths between repeated
 /// measurements of a real ring have mean square pulls of 0.2 to 1.1.
 pub const UNCHANGED: f64 = 0.01;
+/// Class of magnets that have a skew gradient alone.
+pub const SKEW_QUADRUPOLES: &str = "skew quadrupoles";
 /// Class of the factor that all strengths have.
 pub const ALL: &str = "all";
 /// Members that the ordinary scale counts as.
@@ -122,7 +124,7 @@ pub fn class(folder: &Folder, groups: &Groups, kind: Kind) -> String {
             _ => ALL.into(),
         },
         Kind::Skew(group) => match sort(folder, groups[1][group][0]) {
-            "straights" => "skew quadrupoles".into(),
+            "straights" => SKEW_QUADRUPOLES.into(),
             sort => sort.into(),
         },
         Kind::Gradient(group) => sort(folder, groups[2][group][0]).into(),
@@ -166,9 +168,9 @@ impl Family {
         !self.class.is_empty()
     }
 
-    /// True where the scale is that of the members. Most straights have no wiggler, and a wiggler is no scatter of the others.
+    /// True where the scale is that of the members. Wigglers and skew quadrupoles are set one by one: what one is set to is no scatter of the others.
     pub fn has_own_scale(&self) -> bool {
-        self.is_learnt() && self.kind != Kind::Wiggler(0).word()
+        self.is_learnt() && self.kind != Kind::Wiggler(0).word() && self.class != SKEW_QUADRUPOLES
     }
 
     /// True where unknowns of a kind and class are its members, unless they are released.

@@ -159,18 +159,20 @@ pub fn search(hierarchy: &Hierarchy) -> Result<Search, MeasuredError> {
     let mut found = Vec::new();
     while found.len() < MOST {
         let before = members.gains();
-        let odds = |member: usize, gains: &[f64]| gains[member] + members.prior[member];
-        let best = (0..before.len()).max_by(|&a, &b| odds(a, &before).total_cmp(&odds(b, &before)));
-        let Some(best) = best.filter(|&best| odds(best, &before) > RELEASED.ln()) else { break };
+        let odds = |member: usize| before[member] + members.prior[member];
+        let standing: Vec<usize> = (0..before.len()).filter(|&member| odds(member) > RELEASED.ln()).collect();
+        let widening = standing.iter().fold(1.0_f64, |widest, &member| widest.max(members.widening[member]));
+        let explains = |member: usize| members.explained(member) / widening + members.prior[member];
+        let Some(best) = standing.into_iter().max_by(|&a, &b| explains(a).total_cmp(&explains(b))) else { break };
         let mut after = members.clone_released(best);
         let left = after.gains();
         let is_rival = |&member: &usize| {
             member != best && before[member] > (before[best] - NEAR).max(LEAST) && left[member] < TAKEN * before[member]
         };
         let mut rivals: Vec<usize> = (0..before.len()).filter(is_rival).collect();
-        rivals.sort_by(|&a, &b| odds(b, &before).total_cmp(&odds(a, &before)));
-        let weight = |member: usize| (odds(member, &before) - odds(best, &before)).exp();
-        let nothing = (-odds(best, &before)).exp();
+        rivals.sort_by(|&a, &b| explains(b).total_cmp(&explains(a)));
+        let weight = |member: usize| (explains(member) - explains(best)).exp();
+        let nothing = (-odds(best)).exp();
         let sum = 1.0 + nothing + rivals.iter().map(|&rival| weight(rival)).sum::<f64>();
         let width = |member: usize| hierarchy.unknowns[members.unknowns[member]].width;
         let rival = |&member: &usize| Rival {
@@ -249,6 +251,15 @@ impl Members {
 
     fn gain(&self, member: usize) -> f64 {
         self.gain_of(member, self.slope[member] / self.curvature[(member, member)])
+    }
+
+    /// The same with the scatter of its family known and independent errors: rivals of several families are compared by what they explain of the data, whatever the
+    /// tails of their families.
+    fn explained(&self, member: usize) -> f64 {
+        let ordinary = 1.0 / self.curvature[(member, member)];
+        let estimate = self.slope[member] * ordinary;
+        let log_density = |variance: f64| -0.5 * (estimate * estimate / variance + variance.ln());
+        log_density(ordinary + 1.0) - log_density(ordinary)
     }
 
     /// `ln` Bayes factor of a member whose further amplitude is estimated at some value.
