@@ -13,7 +13,9 @@
 //! A scatter told by `n` others, and by what is ordinary, has heavier tails than a normal one: Student's, with `k = n v^2/s^4` degrees of freedom (F. E. Satterthwaite, Biometrics 2 (1946)
 //! 110). What stands out has any size, Cauchy's density about the prior's width (A. Zellner and A. Siow, Trabajos de Estadistica 31 (1980) 585).
 //!
-//! The strongest is released, the others adapt, and so on; those that it takes the gain from are its alternatives.
+//! Of those that may be released the one is that explains most of the data: the same ratio of two normal densities, with independent errors, over the largest of their
+//! widenings. A family that is wide by that very member would hide it behind its neighbour otherwise. It is released, the others adapt, and so on; those that it takes
+//! the gain from are its alternatives.
 
 use nalgebra::{DMatrix, DVector};
 use statrs::distribution::{Continuous, StudentsT};
