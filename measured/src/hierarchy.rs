@@ -3,7 +3,7 @@
 //! instruments. Each kind is a family ([`Family`]) whose scatter is learnt, so that what the ring does not have costs nothing and takes nothing.
 //!
 //! Gauss-Newton on the fit's likelihood with the families' priors; about each linearisation scales are learnt, that of the family first which gains most, then the error
-//! of the model. Once that has settled each family is tried as the last, since the first takes what others explain better together: quadrupoles beside sextupoles
+//! of the model. Once that has settled each family wider than ordinary is tried as the last, since the first takes what others explain better together: quadrupoles beside sextupoles
 //! that were switched off.
 
 use core::cmp::Ordering;

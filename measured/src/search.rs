@@ -173,7 +173,8 @@ pub fn search(hierarchy: &Hierarchy) -> Result<Search, MeasuredError> {
         };
         let mut rivals: Vec<usize> = (0..before.len()).filter(is_rival).collect();
         rivals.sort_by(|&a, &b| explains(b).total_cmp(&explains(a)));
-        let weight = |member: usize| (explains(member) - explains(best)).exp();
+        // a rival that does not stand out itself is no more probable than the one that does
+        let weight = |member: usize| (explains(member) - explains(best)).min(0.0).exp();
         let nothing = (-odds(best)).exp();
         let sum = 1.0 + nothing + rivals.iter().map(|&rival| weight(rival)).sum::<f64>();
         let width = |member: usize| hierarchy.unknowns[members.unknowns[member]].width;
