@@ -168,7 +168,7 @@ impl Family {
         !self.class.is_empty()
     }
 
-    /// True where the scale is that of the members. Wigglers and skew quadrupoles are set one by one: what one is set to is no scatter of the others.
+    /// True where the scale is learnt from the members. Wigglers and skew quadrupoles are set one by one: what one is set to is no scatter of the others.
     pub fn has_own_scale(&self) -> bool {
         self.is_learnt() && self.kind != Kind::Wiggler(0).word() && self.class != SKEW_QUADRUPOLES
     }
@@ -228,7 +228,7 @@ impl Family {
         Some(self.log_prior()? - whole.log_root() + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope)))
     }
 
-    /// `ln` of the root of the prior's determinant, and `ln` probability of the scale beforehand.
+    /// `ln det P/2` and `ln` probability of the scale beforehand, up to a constant.
     pub fn log_prior(&self) -> Option<f64> {
         let square = (self.ordinary / self.scale).powi(2);
         Some(Factor::of(&self.precision())?.log_root() + 0.5 * BEFOREHAND * (square.ln() - square))

@@ -100,12 +100,13 @@ impl Posterior {
         Ok(Self { values: &covariance * &slope, information, slope, covariance })
     }
 
-    /// With scales and then weights that are learnt, and how far the scales went [nat]; `in_any_order` near the end, as it takes several times as long.
-    fn learn(mut self, families: &mut [Family], share: f64, in_any_order: bool) -> Result<(Self, f64), MeasuredError> {
+    /// With scales and then weights that are learnt, and how far the scales went [nat]; with `each_last` each wide family is tried as the last too, which takes several times as
+    /// long.
+    fn learn(mut self, families: &mut [Family], share: f64, each_last: bool) -> Result<(Self, f64), MeasuredError> {
         let own: Vec<usize> = (0..families.len()).filter(|&number| families[number].has_own_scale()).collect();
         let mut gained = self.learn_scales(families, &own, share)?;
-        for &last in own.iter().filter(|_| in_any_order) {
-            gained += self.learn_with_last(families, &own, last, share)?;
+        if each_last {
+            gained += self.learn_each_last(families, &own, share)?;
         }
         for family in families.iter_mut().filter(|family| family.is_learnt()) {
             family.weigh(&family.deviations(&self.values, &self.covariance));
@@ -113,39 +114,51 @@ impl Posterior {
         Ok((Self::of_families(self.information, self.slope, families)?, gained))
     }
 
-    /// What one family took before the others had their turns, they may explain together and better: one that is wider than ordinary is put back, and has its turn
-    /// after the others. What that gained.
-    fn learn_with_last(
-        &mut self,
-        families: &mut [Family],
+    /// What one family took before the others had their turns, they may explain together and better: each that is wider than ordinary has its turn after the others, and what is
+    /// more probable stays. What that gained.
+    fn learn_each_last(&mut self, families: &mut [Family], own: &[usize], share: f64) -> Result<f64, MeasuredError> {
+        let before = self.log_evidence(families)?;
+        let mut best = before;
+        for &last in own {
+            if families[last].scale <= families[last].ordinary {
+                continue;
+            }
+            // a trial that rounding leaves without positive curvature gains nothing
+            let Ok((trial, learnt)) = self.with_last(families, own, last, share) else { continue };
+            let Ok(evidence) = trial.log_evidence(&learnt) else { continue };
+            if evidence - best >= ENOUGH {
+                best = evidence;
+                *self = trial;
+                families.clone_from_slice(&learnt);
+            }
+        }
+        Ok(best - before)
+    }
+
+    /// With one family as in an ordinary ring until the others have learnt, and its scale learnt then.
+    fn with_last(
+        &self,
+        families: &[Family],
         own: &[usize],
         last: usize,
         share: f64,
-    ) -> Result<f64, MeasuredError> {
-        if families[last].scale <= families[last].ordinary {
-            return Ok(0.0);
-        }
-        let mut others = families.to_vec();
-        others[last].scale = families[last].ordinary;
-        let mut there = Self::of_families(self.information.clone(), self.slope.clone(), &others)?;
-        let before: Vec<usize> = own.iter().copied().filter(|&number| number != last).collect();
-        there.learn_scales(&mut others, &before, share)?;
-        there.learn_scales(&mut others, own, share)?;
-        let gain = there.log_evidence(&others)? - self.log_evidence(families)?;
-        if gain < ENOUGH {
-            return Ok(0.0);
-        }
-        *self = there;
-        families.clone_from_slice(&others);
-        Ok(gain)
+    ) -> Result<(Self, Vec<Family>), MeasuredError> {
+        let mut families = families.to_vec();
+        families[last].scale = families[last].ordinary;
+        let mut trial = Self::of_families(self.information.clone(), self.slope.clone(), &families)?;
+        let others: Vec<usize> = own.iter().copied().filter(|&number| number != last).collect();
+        trial.learn_scales(&mut families, &others, share)?;
+        trial.learn_scales(&mut families, own, share)?;
+        Ok((trial, families))
     }
 
-    /// `ln` probability of the measurement, linearised, and of the scales beforehand.
+    /// `ln` probability of the measurement, linearised, and of the scales beforehand, up to a constant.
     fn log_evidence(&self, families: &[Family]) -> Result<f64, MeasuredError> {
         let whole = &self.information + precision(families, self.slope.len());
-        let root = Factor::of(&whole).ok_or(MeasuredError::Singular(0))?.log_root();
+        let factor = Factor::of(&whole).ok_or(MeasuredError::Singular(0))?;
         let priors: Option<f64> = families.iter().map(Family::log_prior).sum();
-        Ok(priors.ok_or(MeasuredError::Singular(0))? - root + 0.5 * self.slope.dot(&self.values))
+        let priors = priors.ok_or(MeasuredError::Singular(0))?;
+        Ok(priors - factor.log_root() + 0.5 * self.slope.dot(&factor.solve(&self.slope)))
     }
 
     /// The scales of some families that make the measurement most probable: that of the family first which gains most, since what one explains another needs not to.
@@ -416,12 +429,12 @@ impl Start {
         let places = Places::of(&self.unknowns, rows, columns);
         let scene = Scene { model, places, width: each(|one| one.width), mean: each(|one| one.mean) };
         let mut prediction = model.predict(&self.unknowns, &self.values)?;
-        let (mut damping, mut followed, mut in_any_order) = (DAMPING, DMatrix::zeros(0, 0), false);
+        let (mut damping, mut followed, mut each_last) = (DAMPING, DMatrix::zeros(0, 0), false);
         for round in 1..=rounds {
             progress(&format!("families, round {round} of {rounds}"));
             let here = self.linearise(&scene, &prediction);
             let share = if round < rounds { NONLINEAR } else { 0.0 };
-            let (posterior, gained) = here.posterior(&self.families)?.learn(&mut self.families, share, in_any_order)?;
+            let (posterior, gained) = here.posterior(&self.families)?.learn(&mut self.families, share, each_last)?;
             let promised;
             (prediction, promised) = self.descend(&scene, &here, prediction, &mut damping)?;
             let left = self.data.residual(&prediction);
@@ -432,10 +445,10 @@ impl Start {
             }
             (self.noise, _) = self.noise.learnt(&self.data, &left, &followed);
             let has_settled = gained + promised < SETTLED;
-            if has_settled && in_any_order {
+            if has_settled && each_last {
                 break;
             }
-            in_any_order |= has_settled;
+            each_last |= has_settled;
         }
         let here = self.linearise(&scene, &prediction);
         let (posterior, _) = here.posterior(&self.families)?.learn(&mut self.families, 0.0, false)?;
@@ -631,12 +644,12 @@ mod tests {
             ordinary: UNCHANGED,
             freedom: 0.0,
         };
-        let learnt = |in_any_order: bool| {
+        let learnt = |each_last: bool| {
             let mut families = [family("all", 0..16), family("large", 16..24), family("small", 24..32)];
             let information = design.tr_mul(&design) * precision;
             let posterior =
                 Posterior::of_families(information, design.tr_mul(&readings) * precision, &families).unwrap();
-            posterior.learn(&mut families, 0.0, in_any_order).unwrap();
+            posterior.learn(&mut families, 0.0, each_last).unwrap();
             families.map(|family| family.scale)
         };
         let [all, large, small] = learnt(false);

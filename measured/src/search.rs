@@ -13,9 +13,9 @@
 //! A scatter told by `n` others, and by what is ordinary, has heavier tails than a normal one: Student's, with `k = n v^2/s^4` degrees of freedom (F. E. Satterthwaite, Biometrics 2 (1946)
 //! 110). What stands out has any size, Cauchy's density about the prior's width (A. Zellner and A. Siow, Trabajos de Estadistica 31 (1980) 585).
 //!
-//! Of those that may be released the one is that explains most of the data: the same ratio of two normal densities, with independent errors, over the largest of their
-//! widenings. A family that is wide by that very member would hide it behind its neighbour otherwise. It is released, the others adapt, and so on; those that it takes
-//! the gain from are its alternatives.
+//! Of the members that stand out, the one that explains most of the data is released, then the others adapt, and so on; those that it takes the gain from are its
+//! alternatives. What a member explains is the same ratio of two normal densities, with independent errors, over the largest widening of those that stand out, and its
+//! probability beforehand. With Student's densities a member that alone widens its family would be hidden by its neighbour.
 
 use nalgebra::{DMatrix, DVector};
 use statrs::distribution::{Continuous, StudentsT};
@@ -259,8 +259,7 @@ impl Members {
     /// The same with the scatter of its family known and independent errors: rivals of several families are compared by what they explain of the data, whatever the
     /// tails of their families.
     fn explained(&self, member: usize) -> f64 {
-        let ordinary = 1.0 / self.curvature[(member, member)];
-        let estimate = self.slope[member] * ordinary;
+        let (ordinary, [estimate, _]) = (1.0 / self.curvature[(member, member)], self.estimate(member));
         let log_density = |variance: f64| -0.5 * (estimate * estimate / variance + variance.ln());
         log_density(ordinary + 1.0) - log_density(ordinary)
     }
