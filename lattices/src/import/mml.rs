@@ -164,12 +164,12 @@ mod tests {
         values[1][0] = Mat::Numbers(vec![0, 0], Vec::new());
         values[0][3] = Mat::Numbers(vec![1, 1], vec![1e-5]);
         values[3][4] = Mat::Text("mm/Ampere".into());
-        let (matrix, stated) = matrix(&file, None).unwrap();
-        assert_eq!((matrix.width, matrix.values, stated.kick), (1, vec![1.0, 2.0], Some(1e3)));
+        let (blocks, stated) = matrix(&file, None).unwrap();
+        assert_eq!((blocks.width, blocks.values, stated.kick), (1, vec![1.0, 2.0], Some(1e3)));
         let Mat::Structs(shape, _, values) = &mut file.variables[1].1 else { panic!("a struct") };
         values.truncate(1);
         *shape = vec![1, 1];
-        let (alone, _) = super::matrix(&file, None).unwrap();
+        let (alone, _) = matrix(&file, None).unwrap();
         assert_eq!(alone.values, [1.0, 2.0]);
     }
 }
