@@ -98,7 +98,7 @@ train: build ## the network trained on the twin, its tables and curves; then the
 network: setup ## the network on the emulated chip beside the host, bit for bit, with instructions
 	cargo test --locked --release -p system-tests --test network -- --nocapture
 
-measured: toolchain ## four measured rings beside LOCO's fits of them: the numbers of docs/real-rings.md; half an hour
+measured: toolchain ## measured rings beside LOCO's fits and operators' records of them: the numbers of docs/real-rings.md; half an hour
 	cargo test --locked --release --workspace --test measured --test measured_changes --test measured_diagnosis -- --include-ignored --nocapture --test-threads 2
 
 figures: toolchain ## the figures of the worked case in docs/diagnosis.md, from the page of its recording

@@ -154,5 +154,6 @@ fn changes_close_over_any_three_measurements() {
             *if is_set { &mut named } else { &mut others } += 1;
         }
     }
+    // 14 and 1: one that is near its limit may go either way where products of matrices round otherwise
     assert!(named >= 13 && others <= 2, "{named} {others}");
 }
