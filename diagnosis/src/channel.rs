@@ -1,7 +1,7 @@
 //! The pooled readings of one monitor, or of one tune, whitened.
 //!
 //! A pool's mean has the noise of its frames: `sigma^2/n` of white noise, and otherwise the mean of the memory's covariance over the
-//! frames of both pools; more where their level is higher ([`Levels`]). With `A` the inverse of the root of that covariance, and the common terms of the readings as the thin decomposition
+//! frames of both pools ([`Filter`]); more where their level is higher ([`Levels`]). With `A` the inverse of the root of that covariance, and the common terms of the readings as the thin decomposition
 //! `A U = Q D V^T`, the whitening is
 //!
 //! `T = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T) A`, so that `T^T T = (C + U U^T)^-1`.
@@ -9,8 +9,7 @@
 use nalgebra::{DMatrix, DMatrixViewMut, DVector, DVectorViewMut};
 
 use super::levels::Levels;
-use super::memory::Memory;
-use evidence::Factor;
+use super::memory::{Filter, Memory};
 
 /// A monitor's or a tune's readings.
 #[derive(Debug, Clone)]
@@ -33,52 +32,36 @@ pub struct Channel {
 enum Root {
     /// White noise: the roots of the numbers of readings, of such as have the ordinary level.
     White(DVector<f64>),
-    /// The inverse of the lower factor of a regular covariance: many columns are whitened by it.
-    Remembers(DMatrix<f64>),
+    /// Noise with a memory.
+    Remembers(Filter),
 }
 
 impl Root {
     /// `frames` of each row.
-    fn from_memory(memory: Memory, levels: &Levels, frames: &[Vec<usize>]) -> Option<Self> {
+    fn from_memory(memory: Memory, levels: &Levels, frames: &[Vec<usize>]) -> Self {
+        let origin = frames.first().map_or(0, |frames| frames[0]);
+        let filter = Filter::from_pools(memory, levels, origin, frames);
         if memory.is_none() {
-            let root = |of_row: &Vec<usize>| {
-                let square: f64 = of_row.iter().map(|&frame| levels.at(frame).powi(2)).sum();
-                ((of_row.len() as f64).powi(2) / square).sqrt()
-            };
-            return Some(Self::White(DVector::from_iterator(frames.len(), frames.iter().map(root))));
+            Self::White(filter.roots().map(f64::recip).collect::<Vec<_>>().into())
+        } else {
+            Self::Remembers(filter)
         }
-        let all = || frames.iter().flatten().copied();
-        let (first, last) = (all().min().unwrap_or(0), all().max().unwrap_or(0));
-        // by the distance of two frames, and of the walk the frames that both have seen
-        let apart: Vec<f64> = (0..=last - first).map(|apart| memory.stationary(apart)).collect();
-        let level: Vec<f64> = (first..=last).map(|frame| levels.at(frame)).collect();
-        let both = |i: usize, j: usize| {
-            apart[i.abs_diff(j)] * (level[i - first] * level[j - first]) + memory.walked(i - first, j - first)
-        };
-        let mean = |one: &[usize], other: &[usize]| {
-            let sum: f64 = one.iter().flat_map(|&i| other.iter().map(move |&j| (i, j))).map(|(i, j)| both(i, j)).sum();
-            sum / (one.len() * other.len()) as f64
-        };
-        let mut covariance = DMatrix::zeros(frames.len(), frames.len());
-        for i in 0..frames.len() {
-            for j in 0..=i {
-                covariance[(i, j)] = mean(&frames[i], &frames[j]);
-            }
-        }
-        Some(Self::Remembers(Factor::of(covariance)?.inverse_lower()))
     }
 
     fn whiten(&self, mut columns: DMatrixViewMut<f64>) {
-        match self {
-            Self::White(roots) => columns.column_iter_mut().for_each(|mut column| column.component_mul_assign(roots)),
-            Self::Remembers(inverse) => columns.copy_from(&(inverse * &columns)),
+        for mut column in columns.column_iter_mut() {
+            match self {
+                Self::White(roots) => column.component_mul_assign(roots),
+                Self::Remembers(filter) => filter.whiten(column.iter_mut()),
+            }
         }
     }
 
-    fn log_det(&self) -> f64 {
+    /// Standard deviation of each row's mean, given those before.
+    fn noise_of_means(&self) -> DVector<f64> {
         match self {
-            Self::White(roots) => -2.0 * roots.iter().map(|root| root.ln()).sum::<f64>(),
-            Self::Remembers(inverse) => -2.0 * inverse.diagonal().iter().map(|d| d.ln()).sum::<f64>(),
+            Self::White(roots) => roots.map(f64::recip),
+            Self::Remembers(filter) => filter.roots().collect::<Vec<_>>().into(),
         }
     }
 }
@@ -92,8 +75,7 @@ impl Channel {
         (sigma, memory, levels): (f64, Memory, &Levels),
         common: DMatrix<f64>,
     ) -> Self {
-        let root = Root::from_memory(memory, levels, frames)
-            .unwrap_or_else(|| Root::White(DVector::from_element(rows.len(), 1.0)));
+        let root = Root::from_memory(memory, levels, frames);
         let mut common = common / sigma;
         root.whiten(common.as_view_mut());
         let (basis, of_common) = match rows.is_empty() {
@@ -104,7 +86,7 @@ impl Channel {
             }
         };
         let grown = of_common.map(|d| 1.0 + d * d);
-        let of_noise = 2.0 * rows.len() as f64 * sigma.ln() + root.log_det();
+        let of_noise = 2.0 * (&root.noise_of_means() * sigma).iter().map(|root| root.ln()).sum::<f64>();
         let log_det = of_noise + grown.iter().map(|g| g.ln()).sum::<f64>();
         Self { rows, sigma, root, basis, shrink: grown.map(|g| 1.0 - g.sqrt().recip()), log_det }
     }
@@ -150,17 +132,14 @@ impl Channel {
 
     /// Standard deviation of each row's mean, given those before, in units of the noise of one reading.
     pub fn noise_of_means(&self) -> DVector<f64> {
-        match &self.root {
-            Root::White(roots) => roots.map(f64::recip),
-            Root::Remembers(inverse) => inverse.diagonal().map(f64::recip),
-        }
+        self.root.noise_of_means()
     }
 
     /// Readings of each row of white noise: as many as tell as much at the ordinary level.
     pub fn readings(&self) -> DVector<f64> {
         match &self.root {
             Root::White(roots) => roots.map(|root| root * root),
-            Root::Remembers(inverse) => DVector::from_element(inverse.nrows(), 1.0),
+            Root::Remembers(_) => DVector::from_element(self.rows.len(), 1.0),
         }
     }
 }

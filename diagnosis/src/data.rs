@@ -743,7 +743,8 @@ impl Data {
             let mut terms = self.drifting_with(b, &rows, &self.frames.drives, shared) / self.channels[b].sigma;
             terms.column_mut(0).fill(1.0);
             let mut residual = values.select_rows(&rows).columns(b, 1).into_owned();
-            let filter = Filter::from_frames(self.noise.memory(b), &self.noise.levels, rows[0], &rows);
+            let each: Vec<&[usize]> = rows.chunks(1).collect();
+            let filter = Filter::from_pools(self.noise.memory(b), &self.noise.levels, rows[0], &each);
             filter.whiten_columns(&mut terms);
             filter.whiten_columns(&mut residual);
             let (chi2, freedom) = chi_square(&residual.column(0).into_owned(), &terms.transpose(), 1, 1.0);
