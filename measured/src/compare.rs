@@ -167,8 +167,9 @@ pub fn compare(
 /// Families of fields beside those of the lattice whose members changed further than what is ordinary.
 fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
     let mut all = Vec::new();
-    let is_field = |family: &&Family| matches!(family.kind, "stray_gradient" | "skew_gradient") && family.is_learnt();
-    let is_wider = |family: &&Family| family.scale > family.ordinary;
+    let is_field = |family: &&Family| matches!(family.kind, "stray_gradient" | "skew_gradient");
+    let is_wider =
+        |family: &&Family| family.is_learnt() && !family.is_set_one_by_one() && family.scale > family.ordinary;
     for family in changed.families.iter().filter(is_field).filter(is_wider) {
         let marginal = changed.posterior.marginal(family)?;
         let ordinary = family.with_scale(family.ordinary);

@@ -75,7 +75,7 @@ pub struct Family {
     pub freedom: f64,
 }
 
-/// Families of all unknowns with an ordinary scale; a member that is released, or that has no family, is one by itself.
+/// Families of all unknowns with an ordinary scale; a member that is released, or that has no family, is one by itself. A family whose members are released stays one.
 pub fn families(
     folder: &Folder,
     groups: &Groups,
@@ -84,11 +84,13 @@ pub fn families(
     ordinary: f64,
 ) -> Vec<Family> {
     let mut members: BTreeMap<(&'static str, String), Vec<usize>> = BTreeMap::new();
-    for (number, unknown) in unknowns.iter().enumerate().filter(|(number, _)| !released.contains(number)) {
+    for (number, unknown) in unknowns.iter().enumerate() {
         members.entry((unknown.kind.word(), class(folder, groups, unknown.kind))).or_default().push(number);
     }
     let (large, small): (Vec<_>, Vec<_>) = members.into_iter().partition(|(_, members)| members.len() >= ENOUGH);
-    let large = large.into_iter().map(|((kind, class), members)| {
+    let is_held = |number: &usize| !released.contains(number);
+    let large = large.into_iter().map(|((kind, class), mut members)| {
+        members.retain(is_held);
         let weights = vec![1.0; members.len()];
         let has_mean = kind == Kind::CorrectorGain(0).word() || kind == Kind::Wiggler(0).word();
         let freedom = if has_mean { FREEDOM } else { 0.0 };
@@ -106,7 +108,11 @@ pub fn families(
             freedom: 0.0,
         }
     };
-    let small = small.into_iter().flat_map(|(_, members)| members).map(|number| alone(number, ALONE * ordinary));
+    let small = small
+        .into_iter()
+        .flat_map(|(_, members)| members)
+        .filter(is_held)
+        .map(|number| alone(number, ALONE * ordinary));
     let released = released.iter().map(|&number| alone(number, FREE));
     large.chain(small).chain(released).collect()
 }
@@ -163,14 +169,24 @@ pub struct Marginal {
 }
 
 impl Family {
-    /// True where the scale is learnt.
-    pub fn is_learnt(&self) -> bool {
+    /// True where its members share something; false of what has a prior of its own.
+    pub fn is_shared(&self) -> bool {
         !self.class.is_empty()
     }
 
-    /// True where the scale is learnt from the members. Wigglers and skew quadrupoles are set one by one: what one is set to is no scatter of the others.
-    pub fn has_own_scale(&self) -> bool {
-        self.is_learnt() && self.kind != Kind::Wiggler(0).word() && self.class != SKEW_QUADRUPOLES
+    /// True where the scale is learnt: of a family with members that are not released.
+    pub fn is_learnt(&self) -> bool {
+        self.is_shared() && !self.members.is_empty()
+    }
+
+    /// True of wigglers and skew quadrupoles. They are set one by one: what one is set to is no scatter that the others have.
+    pub fn is_set_one_by_one(&self) -> bool {
+        self.kind == Kind::Wiggler(0).word() || self.class == SKEW_QUADRUPOLES
+    }
+
+    /// Variance that a member has as one of them, in squares of the prior's width.
+    pub fn expected_variance(&self) -> f64 {
+        if self.is_set_one_by_one() { self.ordinary_scatter().powi(2).min(self.variance()) } else { self.variance() }
     }
 
     /// True where unknowns of a kind and class are its members, unless they are released.
@@ -190,7 +206,7 @@ impl Family {
 
     /// Variance of the members in squares of the prior's width.
     pub fn variance(&self) -> f64 {
-        if self.is_learnt() { NORMAL * self.scale * self.scale } else { self.scale * self.scale }
+        if self.is_shared() { NORMAL * self.scale * self.scale } else { self.scale * self.scale }
     }
 
     /// Standard deviation of the members of an ordinary ring in widths of the prior.

@@ -103,12 +103,12 @@ impl Posterior {
     /// With scales and then weights that are learnt, and how far the scales went [nat]; with `each_last` each wide family is tried as the last too, which takes several times as
     /// long.
     fn learn(mut self, families: &mut [Family], share: f64, each_last: bool) -> Result<(Self, f64), MeasuredError> {
-        let own: Vec<usize> = (0..families.len()).filter(|&number| families[number].has_own_scale()).collect();
+        let own: Vec<usize> = (0..families.len()).filter(|&number| families[number].is_learnt()).collect();
         let mut gained = self.learn_scales(families, &own, share)?;
         if each_last {
             gained += self.learn_each_last(families, &own, share)?;
         }
-        for family in families.iter_mut().filter(|family| family.is_learnt()) {
+        for family in families.iter_mut().filter(|family| family.is_shared()) {
             family.weigh(&family.deviations(&self.values, &self.covariance));
         }
         Ok((Self::of_families(self.information, self.slope, families)?, gained))
@@ -262,11 +262,11 @@ impl Hierarchy {
         released: &[usize],
         progress: &mut dyn FnMut(&str),
     ) -> Result<Self, MeasuredError> {
-        let ordinary = self.families.iter().find(|family| family.is_learnt()).map_or(ORDINARY, |one| one.ordinary);
+        let ordinary = self.families.iter().find(|family| family.is_shared()).map_or(ORDINARY, |one| one.ordinary);
         let released: Vec<usize> = (0..self.unknowns.len()).filter(|&number| self.is_freed(number, released)).collect();
         let mut families = families(folder, &self.groups, &self.unknowns, &released, ordinary);
         for family in &mut families {
-            let known = self.families.iter().find(|one| one.is_learnt() && one.claims(family.kind, &family.class));
+            let known = self.families.iter().find(|one| one.is_shared() && one.claims(family.kind, &family.class));
             let Some(known) = known else { continue };
             (family.scale, family.freedom) = (known.scale, known.freedom);
         }
@@ -322,14 +322,14 @@ impl Hierarchy {
     /// The family that an unknown is of, whether it is released or not.
     pub fn family_of(&self, unknown: usize) -> Option<&Family> {
         let (kind, class) = (self.unknowns[unknown].kind.word(), &self.classes[unknown]);
-        self.families.iter().find(|family| family.is_learnt() && family.claims(kind, class))
+        self.families.iter().find(|family| family.is_shared() && family.claims(kind, class))
     }
 
     /// What a distance from the mean of a family is told in shares of: gains and strengths of the mean of their family, couplings of the mean gain in the other plane,
     /// whose orbits they see or make; 1 of anything else.
     pub fn scale_of(&self, unknown: usize) -> f64 {
         let in_other_plane = |gain: &str| {
-            let is_it = |one: &&Family| one.is_learnt() && one.kind == gain && one.class != self.classes[unknown];
+            let is_it = |one: &&Family| one.is_shared() && one.kind == gain && one.class != self.classes[unknown];
             self.families.iter().find(is_it).map_or(1.0, |gains| gains.mean(&self.values))
         };
         match self.unknowns[unknown].kind {

@@ -71,7 +71,7 @@ impl Outlier {
         let posterior = (hierarchy.sigma_off_family(unknown) / width).powi(2);
         let error = 1.0 / (1.0 / posterior - FREE.powi(-2)).max(f64::EPSILON);
         let estimate = hierarchy.off_family(unknown) / width * error / posterior;
-        let gain = log_bayes_factor(estimate, error, family.variance(), family.members.len());
+        let gain = log_bayes_factor(estimate, error, family.expected_variance(), family.members.len());
         let rivals: f64 = self.alternatives.iter().map(|rival| rival.probability / self.probability).sum();
         self.probability = 1.0 / (1.0 + rivals + (-gain - self.prior).exp());
         self.gain = gain;
@@ -128,7 +128,9 @@ struct Members {
     curvature: DMatrix<f64>,
     /// Weighted squares of the deviations, expected by the posterior, whose mean is the variance of the family.
     squares: Vec<f64>,
-    /// Variance that each has as a member of its family.
+    /// Variance that each has as a member of its family, in the posterior.
+    held: Vec<f64>,
+    /// The same beside which it stands out.
     scatter: Vec<f64>,
     widening: Vec<f64>,
     /// `ln` of the prior probability.
@@ -209,11 +211,12 @@ impl Members {
         // all members of a family alike: what looks like one of them looks like its neighbours too
         let alike: Vec<Family> = families.iter().map(Family::with_equal_weights).collect();
         let equal = Posterior::of_families(posterior.information.clone(), posterior.slope.clone(), &alike)?;
-        let (mut unknowns, mut family, mut squares, mut scatter) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let (mut unknowns, mut family, mut squares) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut held, mut scatter) = (Vec::new(), Vec::new());
         let mut precision = DMatrix::zeros(all.len(), all.len());
         for (number, (one, alike)) in families.iter().zip(&alike).enumerate() {
             alike.add_precision(&mut precision);
-            if one.is_learnt() {
+            if one.is_shared() {
                 let deviations = one.deviations(&posterior.values, &posterior.covariance);
                 unknowns.extend(&one.members);
                 family.extend(one.members.iter().map(|_| number));
@@ -221,8 +224,12 @@ impl Members {
                     deviations.value.iter().zip(&deviations.variance).map(|(value, variance)| value * value + variance);
                 let normal = one.variance() / one.scale.powi(2);
                 let weighted = squared.zip(&one.weights).map(|(square, weight)| normal * square * weight);
-                squares.extend(weighted.map(|square| if one.has_own_scale() { square } else { one.variance() }));
-                scatter.extend(one.members.iter().map(|_| one.scale * one.scale));
+                squares.extend(
+                    weighted.map(|square| if one.is_set_one_by_one() { one.expected_variance() } else { square }),
+                );
+                let square = one.scale * one.scale;
+                held.extend(one.members.iter().map(|_| square));
+                scatter.extend(one.members.iter().map(|_| square.min(one.expected_variance())));
             }
         }
         let slope = &precision * &equal.values;
@@ -237,6 +244,7 @@ impl Members {
             curvature: curvature.select_rows(&unknowns).select_columns(&unknowns),
             widening: unknowns.iter().map(|&unknown| uncertainty.widening(unknown)).collect(),
             prior: unknowns.iter().map(prior).collect(),
+            held,
             scatter,
             released: vec![false; unknowns.len()],
             unknowns,
@@ -259,7 +267,8 @@ impl Members {
     /// The same with the scatter of its family known and independent errors: rivals of several families are compared by what they explain of the data, whatever the
     /// tails of their families.
     fn explained(&self, member: usize) -> f64 {
-        let (ordinary, [estimate, _]) = (1.0 / self.curvature[(member, member)], self.estimate(member));
+        let [estimate, _] = self.estimate(member);
+        let ordinary = self.independent_error(member) + self.scatter[member];
         let log_density = |variance: f64| -0.5 * (estimate * estimate / variance + variance.ln());
         log_density(ordinary + 1.0) - log_density(ordinary)
     }
@@ -275,7 +284,12 @@ impl Members {
 
     /// Variance of what the data say of a further amplitude.
     fn error(&self, member: usize) -> f64 {
-        (1.0 / self.curvature[(member, member)] - self.scatter[member]).max(0.0) * self.widening[member]
+        self.independent_error(member) * self.widening[member]
+    }
+
+    /// The same where errors are independent.
+    fn independent_error(&self, member: usize) -> f64 {
+        (1.0 / self.curvature[(member, member)] - self.held[member]).max(0.0)
     }
 
     /// Variance of an estimate of a further amplitude that is not there: error of the data and scatter of the others.
@@ -304,8 +318,8 @@ impl Members {
         let others = (0..self.unknowns.len()).filter(|&other| other != member && !self.released[other]);
         let of_family = others.filter(|&other| self.family[other] == self.family[member]);
         let (sum, count) = of_family.fold((0.0, 0), |(sum, count), other| (sum + self.squares[other], count + 1));
-        // where all others are released nothing is told
-        (if count > 0 { sum / f64::from(count) } else { 1.0 }, count as usize)
+        // where all others are released the scale of the family is what is known
+        (if count > 0 { sum / f64::from(count) } else { self.scatter[member] }, count as usize)
     }
 
     /// The same with a member released: what it explains is taken from the others.
@@ -321,6 +335,7 @@ impl Members {
             unknowns: self.unknowns.clone(),
             family: self.family.clone(),
             squares: self.squares.clone(),
+            held: self.held.clone(),
             scatter: self.scatter.clone(),
             widening: self.widening.clone(),
             prior: self.prior.clone(),
