@@ -194,9 +194,10 @@ impl Family {
         self.kind == kind && self.class == class
     }
 
-    /// The same with members that all scatter alike.
-    pub fn with_equal_weights(&self) -> Self {
-        Self { weights: vec![1.0; self.members.len()], ..self.clone() }
+    /// The same with members that all scatter alike, unless they are set one by one: what looks like one of them looks like its neighbours too.
+    pub fn with_alike_members(&self) -> Self {
+        let weights = if self.is_set_one_by_one() { self.weights.clone() } else { vec![1.0; self.members.len()] };
+        Self { weights, ..self.clone() }
     }
 
     /// True where the members are about a value of their own.

@@ -208,8 +208,7 @@ pub fn search(hierarchy: &Hierarchy) -> Result<Search, MeasuredError> {
 impl Members {
     fn of_families(hierarchy: &Hierarchy) -> Result<Self, MeasuredError> {
         let Hierarchy { posterior, families, unknowns: all, uncertainty, .. } = hierarchy;
-        // all members of a family alike: what looks like one of them looks like its neighbours too
-        let alike: Vec<Family> = families.iter().map(Family::with_equal_weights).collect();
+        let alike: Vec<Family> = families.iter().map(Family::with_alike_members).collect();
         let equal = Posterior::of_families(posterior.information.clone(), posterior.slope.clone(), &alike)?;
         let (mut unknowns, mut family, mut squares) = (Vec::new(), Vec::new(), Vec::new());
         let (mut held, mut scatter) = (Vec::new(), Vec::new());
@@ -227,9 +226,8 @@ impl Members {
                 squares.extend(
                     weighted.map(|square| if one.is_set_one_by_one() { one.expected_variance() } else { square }),
                 );
-                let square = one.scale * one.scale;
-                held.extend(one.members.iter().map(|_| square));
-                scatter.extend(one.members.iter().map(|_| square.min(one.expected_variance())));
+                held.extend(alike.weights.iter().map(|weight| one.scale * one.scale / weight));
+                scatter.extend(one.members.iter().map(|_| one.expected_variance().min(one.scale * one.scale)));
             }
         }
         let slope = &precision * &equal.values;
