@@ -169,7 +169,7 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
     let mut all = Vec::new();
     let is_field = |family: &&Family| matches!(family.kind, "stray_gradient" | "skew_gradient");
     let is_wider =
-        |family: &&Family| family.is_learnt() && !family.is_set_one_by_one() && family.scale > family.ordinary;
+        |family: &&Family| family.has_members() && !family.is_set_one_by_one() && family.scale > family.ordinary;
     for family in changed.families.iter().filter(is_field).filter(is_wider) {
         let marginal = changed.posterior.marginal(family)?;
         let ordinary = family.with_scale(family.ordinary);

@@ -353,7 +353,7 @@ fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
 }
 
 fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
-    let told = hierarchy.families.iter().filter(|family| family.is_learnt()).map(|family| {
+    let told = hierarchy.families.iter().filter(|family| family.has_members()).map(|family| {
         let width = hierarchy.unknowns[family.members[0]].width;
         let mut sigma: Vec<f64> = family.members.iter().map(|&member| hierarchy.uncertainty.sigma[member]).collect();
         sigma.sort_by(f64::total_cmp);

@@ -174,14 +174,19 @@ impl Family {
         !self.class.is_empty()
     }
 
-    /// True where the scale is learnt: of a family with members that are not released.
-    pub fn is_learnt(&self) -> bool {
+    /// True of a family with members that are not released.
+    pub fn has_members(&self) -> bool {
         self.is_shared() && !self.members.is_empty()
     }
 
-    /// True of wigglers and skew quadrupoles. They are set one by one: what one is set to is no scatter that the others have.
+    /// True where the scale is learnt. That of wigglers is not: with it what all straights have in common would differ by 5 % of a wiggler between two measurements.
+    pub fn is_learnt(&self) -> bool {
+        self.has_members() && self.kind != Kind::Wiggler(0).word()
+    }
+
+    /// True of skew quadrupoles. They are set one by one: what one is set to is no scatter that the others have.
     pub fn is_set_one_by_one(&self) -> bool {
-        self.kind == Kind::Wiggler(0).word() || self.class == SKEW_QUADRUPOLES
+        self.class == SKEW_QUADRUPOLES
     }
 
     /// Variance that a member has as one of them, in squares of the prior's width.

@@ -602,7 +602,7 @@ mod tests {
             let folder = measured(&ring, &truth, NOISE, 700 + seed);
             let fitted = fit(&folder, &settings, &mut |_| ()).unwrap();
             let found = Hierarchy::of_fit(&folder, &fitted, &settings, &mut |_| ()).unwrap();
-            for family in found.families.iter().filter(|family| family.is_learnt()) {
+            for family in found.families.iter().filter(|family| family.has_members()) {
                 scatters.entry(family.kind).or_default().push(family.scale * found.unknowns[family.members[0]].width);
             }
             for (group, [strength, sigma]) in found.strengths().into_iter().take(fitted.groups[0].len()).enumerate() {

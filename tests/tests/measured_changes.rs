@@ -112,7 +112,7 @@ fn wigglers_that_were_closed_focus_vertically() {
 }
 
 /// Ten measurements of one ring in four years, each compared with each, the first before the second: a change from one to another is the sum of those by way of a
-/// third, whatever the supplies were set to. A skew quadrupole that was set is named.
+/// third, whatever the supplies were set to. Two skew quadrupoles that were set are named, and no other.
 #[test]
 #[ignore = "a minute: make measured"]
 fn changes_close_over_any_three_measurements() {
@@ -142,18 +142,23 @@ fn changes_close_over_any_three_measurements() {
     closures.sort_by(f64::total_cmp);
     let (mean, median) = (pulls.iter().sum::<f64>() / pulls.len() as f64, closures[closures.len() / 2]);
     println!("{} closures, median {:.4} %, mean square pull {mean:.2}", closures.len(), 1e2 * median);
-    // 1.05: errors of one measurement are in two of the three comparisons, and cancel in part
+    // 1.11: errors of one measurement are in two of the three comparisons, and cancel in part
     assert!((0.5..1.3).contains(&mean), "{mean}");
 
-    // by the keys set from -0.10 to +1.90 A between the first four and the next four, the wigglers open in all
+    // by the keys set from -0.10 to +1.90 A and from +0.10 to -1.03 A between the first four and the next four, the wigglers open in all
     let [mut named, mut others] = [0, 0];
     for changes in found.iter().filter(|((i, j), _)| *i < 4 && (4..8).contains(j)).map(|(_, changes)| changes) {
         for skew in changes.others.iter().filter(|one| one.word == "skew_gradient" && !one.at.starts_with("all ")) {
             println!("{} {:+.5} /m", skew.at, skew.change);
-            let is_set = skew.at == "SKEWCORR.317" && (0.0036..0.0043).contains(&skew.change);
+            let is_set = match skew.at.as_str() {
+                "SKEWCORR.317" => (0.0036..0.0043).contains(&skew.change),
+                // of the same magnet design, so by the ratio of the currents
+                "SKEWCORR.888" => (-0.0025..-0.0019).contains(&skew.change),
+                _ => false,
+            };
             *if is_set { &mut named } else { &mut others } += 1;
         }
     }
-    // 14 and 1: one that is near its limit may go either way where products of matrices round otherwise
-    assert!(named >= 13 && others <= 2, "{named} {others}");
+    // 32 and 0: one that is near its limit may go either way where products of matrices round otherwise
+    assert!(named >= 30 && others <= 1, "{named} {others}");
 }
