@@ -330,6 +330,26 @@ mod tests {
         assert!(found.gradients.iter().all(|one| !one.has_changed), "{found:?}");
     }
 
+    /// Two of four: the quadrupoles beside them have skew gradients too, and together nearly the same effect.
+    #[test]
+    fn skew_quadrupoles_that_were_set_are_named_and_no_neighbour() {
+        let ring = ring();
+        let truth = machine(&ring, 5);
+        let before = measured(&ring, &truth, NOISE, 1);
+        let (model, unknowns, mut values) = truth;
+        let [strengths, skews, ..] = crate::unknowns::groups(&ring);
+        let set = [(0, 0.012), (2, -0.007)];
+        set.iter().for_each(|(skew, change)| values[strengths.len() + skew] += change);
+        let after = measured(&ring, &(model, unknowns, values), NOISE, 2);
+        let found = compare(&before, &after, &Settings::default(), &mut |_| ()).unwrap().1;
+        assert!(found.others.len() == 2 && found.gradients.iter().all(|one| !one.has_changed), "{found:?}");
+        for (skew, change) in set {
+            let at = ring.element(skews[skew][0]);
+            let one = found.others.iter().find(|one| one.word == "skew_gradient" && one.at == at).unwrap();
+            assert!((one.change - change).abs() < 4.0 * one.sigma && one.sigma < 0.002, "{one:?}");
+        }
+    }
+
     #[test]
     fn gains_and_cables_that_changed_are_named() {
         let ring = ring();
