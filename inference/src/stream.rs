@@ -11,7 +11,7 @@ use core::fmt;
 use estimator::surrogate::Unstable;
 use estimator::{
     CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode,
-    Prepared, Prior, RfCode, Sizes, StateError, TuneCode,
+    Prepared, RfCode, Sizes, StateError, TuneCode,
 };
 use training::rooms::{largest, ramped};
 use training::{Tables, in_room, in_spare_room};
@@ -257,14 +257,6 @@ impl Core {
     /// What the posterior expects of the readings of the last frame [B] [m]; before the next [`Core::slice`].
     pub fn fitted(&self) -> Vec<f32> {
         self.stream.fitted()
-    }
-
-    /// Prior of a param.
-    ///
-    /// # Panics
-    /// If there is no such param.
-    pub fn prior(&self, i: usize) -> Prior {
-        self.setup.priors[self.tables.prior_group(i)]
     }
 }
 

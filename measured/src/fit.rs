@@ -65,8 +65,6 @@ pub struct Fit {
     pub noise: Noise,
     /// Measured less predicted [mm], with the dispersion as the last column; 0 where nothing counts.
     pub residual: DMatrix<f64>,
-    /// The same of the fit with the stated noise alone.
-    pub stated_residual: DMatrix<f64>,
     /// Gauss-Newton steps.
     pub steps: usize,
     /// False where the last descent was still moving when its steps were used up: the model is far from the measurement.
@@ -144,7 +142,6 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     }
     let elements = data.elements();
     let chi2_loco = data.chi2(&as_stated.prediction) / elements as f64;
-    let stated_residual = data.residual(&as_stated.prediction);
     let steps = as_stated.steps;
     let stated = Noise::stated(data.measured.nrows());
     let Learnt { here, noise, uncertainty } =
@@ -158,7 +155,6 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
         residual: data.residual(&here.prediction),
         data,
         noise,
-        stated_residual,
         steps: steps + here.steps,
         has_ended: here.has_ended,
         values: here.values,

@@ -130,11 +130,6 @@ impl Recording {
         mean_supplies(&self.drives())
     }
 
-    /// A current that the model has no use for, by its column [A].
-    pub fn other(&self, row: &Row, column: &str) -> Option<f64> {
-        self.other.iter().position(|name| name == column).map(|at| row.other[at])
-    }
-
     /// Largest kick that a corrector was set to, by read-back where settings are not recorded [rad]; 1 where none was.
     pub fn nominal_kick(&self) -> f64 {
         let kick = |(c, current): (usize, f64)| (current * self.header.kick_per_ampere[c]).abs();

@@ -1,6 +1,6 @@
 //! The estimate of a core after a frame, for a ring of any size.
 
-use estimator::{Health, Layout, Marginal, Mask, MonitorState, Prior, Remarks};
+use estimator::{Health, Layout, Mask, MonitorState, Remarks};
 use training::rooms::largest;
 
 /// The vars and the state of the monitors after a frame: [`estimator::Estimate`] without spare slots.
@@ -33,17 +33,6 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Marginal posterior of param `i`; none beyond the last.
-    pub fn marginal(&self, i: usize, prior: &Prior) -> Option<Marginal> {
-        let Prior { lower, upper, .. } = *prior;
-        Some(Marginal { mean: *self.centre.get(i)?, sigma: *self.params_sigma.get(i)?, lower, upper })
-    }
-
-    /// Readings that were used, tunes included.
-    pub fn readings(&self) -> usize {
-        self.accepted.iter().filter(|accepted| **accepted).count() + self.tune_innovation.iter().flatten().count()
-    }
-
     /// That of a core which has room for the ring.
     pub fn from_core<const B: usize, const N: usize, const W: usize>(
         e: &estimator::Estimate<B, N, W>,
