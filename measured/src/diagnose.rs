@@ -5,17 +5,16 @@
 //! ([`Hierarchy`]); members that stand out are released, and all is fitted anew ([`search`]); what was found has to predict elements that it was
 //! not fitted to ([`HeldOut`]).
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 use twin::Rf;
 
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
-use crate::held_out::{Fitted, HeldOut};
+use crate::held_out::HeldOut;
 use crate::hierarchy::Hierarchy;
 use crate::hold::Share;
 use crate::model::Model;
-use crate::normal::Places;
 use crate::search::{NAMED, Outlier, Rival, Search, search};
 use crate::straight::DEAD;
 use crate::unknowns::{self, Groups, Kind, name};
@@ -388,38 +387,20 @@ fn limits(folder: &Folder, hierarchy: &Hierarchy, found: &Search) -> Vec<Limit> 
 fn as_loco(folder: &Folder, fitted: &Fit, settings: &Settings) -> Result<HeldOut, MeasuredError> {
     let n = fitted.unknowns.len();
     let prediction = Model::of(folder, &fitted.groups, settings.rf)?.predict(&fitted.unknowns, &fitted.values)?;
-    let places = Places::of(&fitted.unknowns, prediction.matrix.nrows(), prediction.matrix.ncols());
-    let each = fitted.unknowns.iter().zip(&fitted.values);
-    let pull = DVector::from_iterator(n, each.map(|(unknown, value)| (value - unknown.mean) / unknown.width));
-    let width = DVector::from_iterator(n, fitted.unknowns.iter().map(|unknown| unknown.width));
-    let fit = Fitted {
-        places: &places,
-        prediction: &prediction,
-        precision: &DMatrix::identity(n, n),
-        pull: &pull,
-        noise: &fitted.noise,
-        width: &width,
-    };
-    HeldOut::of_fit(&fitted.data, &fitted.data, &fit)
+    HeldOut::of_fit(
+        (&fitted.data, &fitted.data),
+        (&fitted.unknowns, &fitted.values, &prediction),
+        (&DMatrix::identity(n, n), &fitted.noise),
+    )
 }
 
 /// The fit with families and findings on elements held out.
 fn with_families(hierarchy: &Hierarchy, fitted: &Fit) -> Result<HeldOut, MeasuredError> {
-    let (rows, columns) = hierarchy.prediction.matrix.shape();
-    let places = Places::of(&hierarchy.unknowns, rows, columns);
-    let width =
-        DVector::from_iterator(hierarchy.unknowns.len(), hierarchy.unknowns.iter().map(|unknown| unknown.width));
-    let precision = hierarchy.precision();
-    let pull = &precision * hierarchy.off_priors();
-    let fit = Fitted {
-        places: &places,
-        prediction: &hierarchy.prediction,
-        precision: &precision,
-        pull: &pull,
-        noise: &hierarchy.noise,
-        width: &width,
-    };
-    HeldOut::of_fit(&hierarchy.data, &fitted.data, &fit)
+    HeldOut::of_fit(
+        (&hierarchy.data, &fitted.data),
+        (&hierarchy.unknowns, &hierarchy.values, &hierarchy.prediction),
+        (&hierarchy.precision(), &hierarchy.noise),
+    )
 }
 
 /// Monitors' rows and correctors' columns whose residuals are larger than those of the others.
