@@ -6,7 +6,7 @@
 //! not fitted to ([`HeldOut`]).
 
 use nalgebra::DMatrix;
-use twin::Rf;
+use twin::{Rf, median};
 
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings};
@@ -354,8 +354,7 @@ fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
 fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
     let told = hierarchy.families.iter().filter(|family| family.is_learnt()).map(|family| {
         let width = hierarchy.unknowns[family.members[0]].width;
-        let mut sigma: Vec<f64> = family.members.iter().map(|&member| hierarchy.uncertainty.sigma[member]).collect();
-        sigma.sort_by(f64::total_cmp);
+        let sigma = median(family.members.iter().map(|&member| hierarchy.uncertainty.sigma[member]));
         Imperfection {
             word: family.kind,
             class: family.class.clone(),
@@ -363,7 +362,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             mean: family.mean(&hierarchy.off_priors()) * width,
             scatter: family.variance().sqrt() * width,
             ordinary: family.ordinary_scatter() * width,
-            sigma: sigma[sigma.len() / 2],
+            sigma: sigma.expect("a family that is learnt has members"),
         }
     });
     told.collect()
