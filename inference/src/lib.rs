@@ -35,6 +35,8 @@ mod readings;
 pub mod recording;
 pub mod simulate;
 pub mod stream;
+#[cfg(test)]
+mod testing;
 
 pub use base_model::{BaseModel, BaseTerm, FittedTerm};
 pub use bounds::{Bounded, Coordinate, Coordinates, softplus};
