@@ -297,7 +297,6 @@ fn scatter_of_idle_correctors_takes_no_frame_away() {
             let recording = scattered(&ring, &given, &truth, ampere, follows, seed);
             let campaign = Campaign::of(&ring, &recording).unwrap();
             let fit = BatchFit::best(&campaign, TuneUse::Readings, BaseModel::EXACT, |_| ()).unwrap();
-            println!("{what}: {} settings, share {:.2}", campaign.settings.count(), campaign.followed);
             assert_sound(&format!("fit of {what}"), fit.chi2_per_dof, nees(&fit, &truth));
             let of_core = replayed(&ring, &recording, &fit);
             assert_sound(&format!("replay of {what}"), of_core.chi2_per_dof, nees(&of_core, &truth));

@@ -1,7 +1,7 @@
 //! Have the chains converged, and how many independent draws are they worth?
 //!
 //! For one quantity, its draws chain by chain, all of one length. The numbers are those of ArviZ 0.23, so that a reader
-//! can check them there: `az.rhat`, `az.ess` with the methods `bulk` and `tail`, `az.mcse` with `mean` and `sd`.
+//! can check them there: `az.rhat`, `az.ess` with the methods `bulk` and `tail`, `az.mcse` with `mean`.
 //!
 //! A diagnostic is NaN where it cannot be known: for chains of fewer than four draws or of different lengths, for no
 //! chain at all, and where a draw is NaN. An infinite draw is larger or smaller than all others for what works by ranks
@@ -79,23 +79,6 @@ pub fn mcse_mean<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
     }
     let draws: Vec<f64> = pooled(chains).collect();
     (variance(&draws) / Halves::split(chains).ess()).sqrt()
-}
-
-/// Monte Carlo standard error of the standard deviation of all draws, in the draws' unit.
-///
-/// `√(var(d)/ESS(d)/⟨d⟩)/2` with `d = (x − x̄)²`. NaN for constant draws, or zero where their mean is rounded.
-///
-/// Source: ArviZ 0.23, `az.mcse(method="sd")`: the delta method on the mean of `d`.
-pub fn mcse_sd<C: AsRef<[f64]>>(chains: &[C]) -> f64 {
-    if !are_valid(chains) {
-        return f64::NAN;
-    }
-    let centre = mean(&pooled(chains).collect::<Vec<_>>());
-    let squared = |draw: f64| (draw - centre) * (draw - centre);
-    let squares: Vec<f64> = pooled(chains).map(squared).collect();
-    let fourth = squares.iter().map(|square| square * square).sum::<f64>() / squares.len() as f64;
-    let second = mean(&squares);
-    ((fourth - second * second) / Halves::split(chains).map(squared).ess() / second / 4.0).sqrt()
 }
 
 /// Quantile of values in rising order by linear interpolation, as of numpy and type 7 of R, in the values' unit.
@@ -275,8 +258,8 @@ fn geyer(draws: usize, rho: impl Fn(usize) -> f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn all(chains: &[Vec<f64>]) -> [f64; 5] {
-        [r_hat(chains), ess_bulk(chains), ess_tail(chains), mcse_mean(chains), mcse_sd(chains)]
+    fn all(chains: &[Vec<f64>]) -> [f64; 4] {
+        [r_hat(chains), ess_bulk(chains), ess_tail(chains), mcse_mean(chains)]
     }
 
     /// A fixed order of 0 to 99 without a trend: steps by a primitive root of 101.
@@ -296,8 +279,8 @@ mod tests {
 
     #[test]
     fn constant_chains_count_as_independent_draws_without_r_hat() {
-        let [r_hat, ess_bulk, ess_tail, mcse_mean, mcse_sd] = all(&[vec![2.5; 11], vec![2.5; 11]]);
-        assert!(r_hat.is_nan() && mcse_sd.is_nan());
+        let [r_hat, ess_bulk, ess_tail, mcse_mean] = all(&[vec![2.5; 11], vec![2.5; 11]]);
+        assert!(r_hat.is_nan());
         assert_eq!([ess_bulk, ess_tail, mcse_mean], [20.0, 20.0, 0.0]); // the middle draws of 11 belong to no half
     }
 
@@ -317,9 +300,9 @@ mod tests {
         let mut infinite = [scattered(), scattered()];
         let [r_hat, ess_bulk, ess_tail, ..] = all(&infinite);
         infinite.iter_mut().flatten().filter(|draw| **draw == 99.0).for_each(|draw| *draw = f64::INFINITY);
-        let [ranked @ .., mcse_mean, mcse_sd] = all(&infinite);
+        let [ranked @ .., mcse_mean] = all(&infinite);
         assert_eq!(ranked, [r_hat, ess_bulk, ess_tail]);
-        assert!(mcse_mean.is_nan() && mcse_sd.is_nan());
+        assert!(mcse_mean.is_nan());
     }
 
     #[test]

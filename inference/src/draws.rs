@@ -1,12 +1,8 @@
 //! What a sampler leaves: draws of named quantities chain by chain, with how each one came about.
 
-use std::io::ErrorKind;
-use std::path::PathBuf;
-
 use crate::diagnostics::{ess_bulk, ess_tail, mcse_mean, mean, quantile, r_hat, sorted, variance};
-use crate::recording::Mismatch;
 
-/// Draws of all chains; files of them are CmdStan's ([`Draws::write`], [`Draws::read`]).
+/// Draws of all chains.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Draws {
     /// Names of the quantities; elements of a vector are `vars.1`, `vars.2`, as of CmdStan [N].
@@ -70,54 +66,6 @@ pub struct Summary {
     pub ess_tail: f64,
 }
 
-/// Why draws were not written or read; prints as one line.
-#[non_exhaustive]
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum DrawsError {
-    /// A file is absent, closed to us or not text.
-    #[error("{}: cannot be read as UTF-8 text: {}", .0.display(), .1)]
-    Unreadable(PathBuf, ErrorKind),
-    /// A file or folder cannot be written.
-    #[error("{}: cannot be written: {}", .0.display(), .1)]
-    Unwritable(PathBuf, ErrorKind),
-    /// A name that would be read back as something else, or that is there twice.
-    #[error("{0:?} cannot name a quantity: expected words without a comma and `__` at the end, each once")]
-    Name(String),
-    /// A chain does not have as many draws as the first, or as many statistics as draws.
-    #[error("chain {chain}: expected {need} draws with their statistics, found {draws} with {stats}")]
-    Length {
-        /// The chain, from 1.
-        chain: usize,
-        /// Draws of the first chain.
-        need: usize,
-        /// Draws of this one.
-        draws: usize,
-        /// Statistics of this one.
-        stats: usize,
-    },
-    /// A draw has too many or too few values.
-    #[error("chain {chain}, draw {draw}: expected {need} values, found {found}")]
-    Values {
-        /// The chain, from 1.
-        chain: usize,
-        /// The draw, from 1.
-        draw: usize,
-        /// Names there are.
-        need: usize,
-        /// Values there are.
-        found: usize,
-    },
-    /// The columns of a file are not the statistics of the draws, and then the quantities of the first file.
-    #[error("{0}")]
-    Columns(Mismatch),
-    /// A line has too many or too few cells.
-    #[error("{0}")]
-    CellCount(Mismatch),
-    /// A cell is not what its column holds.
-    #[error("{0}")]
-    Cell(Mismatch),
-}
-
 impl Draws {
     /// Draws of one quantity, chain by chain.
     ///
@@ -140,39 +88,6 @@ impl Draws {
     pub fn divergences(&self) -> usize {
         self.chains.iter().flat_map(|chain| &chain.stats).filter(|stats| stats.divergent).count()
     }
-
-    /// Whether files can hold these draws.
-    pub(crate) fn check(&self) -> Result<(), DrawsError> {
-        let is_new = |i: usize, name| !self.names[..i].contains(name);
-        let unfit = self.names.iter().enumerate().find(|&(i, name)| !is_name(name) || !is_new(i, name));
-        if let Some((_, name)) = unfit {
-            return Err(DrawsError::Name(name.clone()));
-        }
-        let need = self.chains.first().map_or(0, |chain| chain.draws.len());
-        (1..).zip(&self.chains).try_for_each(|(number, chain)| chain.check(number, need, self.names.len()))
-    }
-}
-
-impl Chain {
-    fn check(&self, chain: usize, need: usize, names: usize) -> Result<(), DrawsError> {
-        let (draws, stats) = (self.draws.len(), self.stats.len());
-        if [draws, stats] != [need, need] {
-            return Err(DrawsError::Length { chain, need, draws, stats });
-        }
-        match self.draws.iter().position(|draw| draw.len() != names) {
-            Some(i) => Err(DrawsError::Values { chain, draw: i + 1, need: names, found: self.draws[i].len() }),
-            None => Ok(()),
-        }
-    }
-}
-
-/// A word, and for the element of an array its indices, each after a point. CmdStan's own columns end in `__`.
-fn is_name(name: &str) -> bool {
-    let mut parts = name.split('.');
-    let word = parts.next().unwrap_or_default();
-    let is_index = |part: &str| part.parse::<u32>().is_ok_and(|index| index > 0);
-    let splits = |c: char| c == ',' || c == '"' || c == '#' || c.is_whitespace() || c.is_control();
-    !word.is_empty() && !word.ends_with("__") && !word.contains(splits) && parts.all(is_index)
 }
 
 impl Summary {
@@ -211,10 +126,6 @@ mod tests {
         Draws { names: vec!["A2".into(), "vars.1".into()], chains }
     }
 
-    fn named(names: [&str; 2]) -> Draws {
-        Draws { names: names.map(String::from).to_vec(), ..two_chains() }
-    }
-
     #[test]
     fn quantity_is_chain_by_chain() {
         assert_eq!(two_chains().quantity(0), [[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]]);
@@ -233,28 +144,6 @@ mod tests {
     fn summary_of_nothing_is_nan() {
         let nothing = Draws { names: vec!["A2".into()], chains: Vec::new() }.summary();
         assert!(nothing[0].mean.is_nan() && nothing[0].sd.is_nan() && nothing[0].q16.is_nan());
-    }
-
-    #[test]
-    fn names_that_a_file_would_change_are_refused() {
-        for good in ["A2", "vars.12", "gain_x.1.3", "β"] {
-            assert_eq!(named([good, "other"]).check(), Ok(()), "{good}");
-        }
-        for bad in ["", "a,b", "a b", "a\n", "\"a\"", "#a", "lp__", ".1", "vars.0", "vars.x", "vars.", "other"] {
-            assert_eq!(named(["other", bad]).check(), Err(DrawsError::Name(bad.into())));
-        }
-    }
-
-    #[test]
-    fn chains_that_do_not_match_are_refused() {
-        let mut short = two_chains();
-        short.chains[1].draws.pop();
-        let expected = "chain 2: expected 4 draws with their statistics, found 3 with 4";
-        assert_eq!(short.check().map_err(|error| error.to_string()), Err(expected.into()));
-        let mut narrow = two_chains();
-        narrow.chains[1].draws[2].pop();
-        let expected = "chain 2, draw 3: expected 2 values, found 1";
-        assert_eq!(narrow.check().map_err(|error| error.to_string()), Err(expected.into()));
     }
 
     #[test]

@@ -126,17 +126,10 @@ fn tune_information(recording: &Recording) -> [f64; 2] {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
     use crate::draws::Chain;
+    use crate::testing::recorded;
     use crate::{BatchFit, Campaign, TuneUse};
-
-    fn recorded() -> (Ring, Recording) {
-        let (ring, folder) = (Ring::booster(), Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars"));
-        let recording = Recording::read(&folder, &ring).unwrap();
-        (ring, recording)
-    }
 
     fn fitted(ring: &Ring, recording: &Recording) -> BatchFit {
         let campaign = Campaign::of(ring, recording).unwrap();
@@ -146,7 +139,8 @@ mod tests {
     /// A recording fitted with the design, and with one whose dipoles have a gradient of a tenth of the width: the vars differ by the pattern.
     #[test]
     fn vars_imitate_a_gradient_in_all_dipoles() {
-        let (ring, recording) = recorded();
+        let ring = Ring::booster();
+        let recording = recorded(&ring, "paper-vars");
         let fit = fitted(&ring, &recording);
         let imitation = Imitation::new(&ring, &recording).unwrap();
         let width = BaseModel::MAGNETS.terms()[0].width();
@@ -161,7 +155,8 @@ mod tests {
 
     #[test]
     fn error_bars_are_never_wider_than_the_prior() {
-        let (ring, recording) = recorded();
+        let ring = Ring::booster();
+        let recording = recorded(&ring, "paper-vars");
         let ring = crate::with_priors(&ring, Some(1e-4), None);
         let widened = Imitation::new(&ring, &recording).unwrap().widened(&fitted(&ring, &recording).covariance);
         assert!((0..48).all(|i| widened[(i, i)].sqrt() < 1.001e-4));
@@ -169,7 +164,8 @@ mod tests {
 
     #[test]
     fn draws_are_widened_as_the_covariance_is() {
-        let (ring, recording) = recorded();
+        let ring = Ring::booster();
+        let recording = recorded(&ring, "paper-vars");
         let imitation = Imitation::new(&ring, &recording).unwrap();
         let chain = Chain { draws: vec![vec![1.0; 48]; 4000], ..Chain::default() };
         let draws = imitation.redrawn(&Draws { names: ring.var_names(), chains: vec![chain] }, 5);

@@ -21,7 +21,6 @@
 mod base_model;
 mod bounds;
 mod campaign;
-mod cmdstan;
 mod diagnostics;
 mod draws;
 mod imitation;
@@ -36,6 +35,8 @@ mod readings;
 pub mod recording;
 pub mod simulate;
 pub mod stream;
+#[cfg(test)]
+mod testing;
 
 pub use base_model::{BaseModel, BaseTerm, FittedTerm};
 pub use bounds::{Bounded, Coordinate, Coordinates, softplus};
@@ -43,8 +44,8 @@ pub use campaign::{
     Campaign, Excluded, Exclusions, Meter, Screened, Setting, Settings, Stray, TUNE_CALIBRATION, Times, chi_square,
     furthest_stray,
 };
-pub use diagnostics::{mcse_sd, quantile};
-pub use draws::{Chain, DrawStats, Draws, DrawsError, Summary};
+pub use diagnostics::quantile;
+pub use draws::{Chain, DrawStats, Draws, Summary};
 pub use imitation::Imitation;
 pub use imperfection::{Imperfection, Measure, POSITION, THROUGHOUT};
 pub use map_fit::{BatchError, BatchFit, FittedTune, Lack, OpticsFunctions, TuneUse};

@@ -39,8 +39,6 @@ pub struct BatchFit {
     pub tunes: [FittedTune; 2],
     /// Why the orbits do not constrain the params, if so: the result is then the prior, but for measured tunes.
     pub lack: Option<Lack>,
-    /// Rms of the baselines in x and y [m].
-    pub orbit: [f64; 2],
     /// What the design is off by, of the terms that were fitted.
     pub base: Vec<FittedTerm>,
     /// The base model that was fitted.
@@ -198,8 +196,6 @@ struct Point {
     of_orbits: DMatrix<f64>,
     /// Chi-square of the monitors in state ok by their expected noise, and its degrees of freedom.
     chi2: (f64, f64),
-    /// Rms of the baselines in x and y [m].
-    orbit: [f64; 2],
     tunes: Tunes,
 }
 
@@ -216,9 +212,7 @@ impl Objective for Problem<'_> {
             self.add_tunes(&mut normal, &linearised);
         }
         let (cost, quadratic) = normal.eliminated();
-        let here = DVector::zeros(params.len());
-        let orbit = self.campaign.rms_by_plane(&normal.baselines(&here));
-        Ok((cost, Point { quadratic, of_orbits: of_orbits.matrix, chi2, orbit, tunes: linearised.at_mean.tunes }))
+        Ok((cost, Point { quadratic, of_orbits: of_orbits.matrix, chi2, tunes: linearised.at_mean.tunes }))
     }
 
     fn linearise(&self, _: &DVector<f64>, point: &Point) -> Result<(Quadratic, ()), OrbitError> {
@@ -295,7 +289,6 @@ impl Problem<'_> {
             mismatch: quality(point.chi2).is_mismatch(),
             tunes: [tune(0, point.tunes.x), tune(1, point.tunes.y)],
             lack: self.lack(&point.of_orbits),
-            orbit: point.orbit,
             steps: found.steps,
         })
     }

@@ -20,7 +20,7 @@ use nuts_rs::{
 use rand::Rng;
 use twin::limits::{DRAWS, Exceeded};
 
-use crate::draws::{Chain, DrawStats, Draws, Summary};
+use crate::draws::{Chain, DrawStats, Draws};
 use crate::posterior::{Laplace, Posterior};
 
 /// How to sample.
@@ -109,14 +109,6 @@ impl Unstable {
 ///
 /// Source: A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P. Buerkner, Bayesian Anal. 16 (2021) 667, sec. 4.
 pub const UNMIXED: f64 = 1.01;
-
-impl NutsRun {
-    /// The quantity with the largest R-hat, if that says that the chains have not mixed.
-    pub fn unmixed(&self) -> Option<Summary> {
-        let worst = self.draws.summary().into_iter().max_by(|one, other| one.r_hat.total_cmp(&other.r_hat));
-        worst.filter(|summary| summary.r_hat.is_nan() || summary.r_hat > UNMIXED)
-    }
-}
 
 /// Sample a posterior about its Laplace approximation; `progress` hears of finished draws, warm-up included, every 0.1 s, and may break off.
 ///

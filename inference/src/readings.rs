@@ -356,20 +356,15 @@ impl Form {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
-    use twin::Ring;
-
     use super::*;
     use crate::base_model::BaseModel;
     use crate::recording::Recording;
+    use crate::testing::ten_cells;
 
     /// A recording of format 2 need not name the correctors that were set.
     #[test]
     fn frames_repeat_each_other_by_their_read_backs() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
-        let ring = Ring::read(&folder.join("ring.json")).unwrap();
-        let mut recording = Recording::read(&folder.join("plain"), &ring).unwrap();
+        let (ring, mut recording) = ten_cells();
         let repeats = |recording: &Recording| {
             let campaign = Campaign::of(&ring, recording).unwrap();
             let fit = BatchFit::best(&campaign, TuneUse::LeftOut, BaseModel::EXACT, |_| ()).unwrap();

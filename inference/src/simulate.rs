@@ -124,16 +124,10 @@ pub enum VarsError {
     },
 }
 
-/// Which tunes a ring may have in a plane.
-struct Window {
-    design: f64,
-    tune_cut: bool,
-}
-
 /// Which tunes the machines of a ring may have.
 pub struct TuneWindow {
-    x: Window,
-    y: Window,
+    design: Tunes,
+    tune_cut: bool,
 }
 
 impl TuneWindow {
@@ -142,23 +136,18 @@ impl TuneWindow {
     /// # Errors
     /// [`OrbitError`] if the design has no tunes.
     pub fn from_ring(ring: &Ring, tune_cut: bool) -> Result<Self, OrbitError> {
-        let design = tunes(ring)?;
-        let [x, y] = [design.x, design.y].map(|design| Window { design, tune_cut });
-        Ok(Self { x, y })
+        Ok(Self { design: tunes(ring)?, tune_cut })
     }
 
     /// True for tunes that a machine may have.
     pub fn holds(&self, tunes: Tunes) -> bool {
-        self.x.holds(tunes.x) && self.y.holds(tunes.y)
-    }
-}
-
-impl Window {
-    fn holds(&self, tune: f64) -> bool {
-        let below = (2.0 * self.design).floor() / 2.0;
-        let own = (self.design - below).min(below + 0.5 - self.design);
-        let band = STOP_BAND.min(0.5 * own);
-        (band..=0.5 - band).contains(&(tune - below)) && (!self.tune_cut || (tune - self.design).abs() < TUNE_CUT)
+        let is_held = |design: f64, tune: f64| {
+            let below = (2.0 * design).floor() / 2.0;
+            let own = (design - below).min(below + 0.5 - design);
+            let band = STOP_BAND.min(0.5 * own);
+            (band..=0.5 - band).contains(&(tune - below)) && (!self.tune_cut || (tune - design).abs() < TUNE_CUT)
+        };
+        is_held(self.design.x, tunes.x) && is_held(self.design.y, tunes.y)
     }
 }
 
@@ -174,7 +163,7 @@ pub fn vars(ring: &Ring, tune_cut: bool, seed: u64) -> Result<Vec<f64>, VarsErro
     let drawn = || ring.parameters.iter().map(|parameter| draw(&parameter.prior, &mut random)).collect();
     let keeps = |vars: &Vec<f64>| tunes(&ring.with_vars(vars)).is_ok_and(|at| window.holds(at));
     let kept = core::iter::repeat_with(drawn).take(TRIES).find(keeps);
-    kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [window.x.design, window.y.design] })
+    kept.ok_or_else(|| VarsError::Rare { ring: ring.name.clone(), tunes: [window.design.x, window.design.y] })
 }
 
 fn tunes(ring: &Ring) -> Result<Tunes, OrbitError> {

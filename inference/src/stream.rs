@@ -11,7 +11,7 @@ use core::fmt;
 use estimator::surrogate::Unstable;
 use estimator::{
     CurrentCode, FitQuality, FrameError, IngestError, IntensityCode, Layout, MagnetCurrents, Mask, PositionCode,
-    Prepared, Prior, RfCode, Sizes, StateError, TuneCode,
+    Prepared, RfCode, Sizes, StateError, TuneCode,
 };
 use training::rooms::{largest, ramped};
 use training::{Tables, in_room, in_spare_room};
@@ -258,14 +258,6 @@ impl Core {
     pub fn fitted(&self) -> Vec<f32> {
         self.stream.fitted()
     }
-
-    /// Prior of a param.
-    ///
-    /// # Panics
-    /// If there is no such param.
-    pub fn prior(&self, i: usize) -> Prior {
-        self.setup.priors[self.tables.prior_group(i)]
-    }
 }
 
 impl fmt::Debug for Core {
@@ -375,15 +367,12 @@ pub fn replay(
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
+    use crate::testing::{recorded, ten_cells};
 
     /// What is said of the first row of a recording with one of its values changed; nothing if a frame carries it.
     fn refused(change: impl Fn(&mut Row)) -> Option<String> {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/ten-cells");
-        let ring = Ring::read(&folder.join("ring.json")).unwrap();
-        let recording = Recording::read(&folder.join("plain"), &ring).unwrap();
+        let (_, recording) = ten_cells();
         let mut row = recording.rows[0].clone();
         change(&mut row);
         wire(&recording, &row).err().map(|error| error.to_string())
@@ -392,8 +381,7 @@ mod tests {
     #[test]
     fn a_core_that_was_loaded_goes_on_to_the_bit() {
         let ring = Ring::booster();
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-        let recording = Recording::read(&folder, &ring).unwrap();
+        let recording = recorded(&ring, "paper-vars");
         for walk in [Walk::NONE, FOLLOW] {
             let mut whole = estimator(&ring, &recording, walk).unwrap();
             let mut core = whole.clone();
@@ -427,8 +415,7 @@ mod tests {
     #[test]
     fn a_feedback_changes_no_estimate() {
         let ring = Ring::booster();
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-        let recording = Recording::read(&folder, &ring).unwrap();
+        let recording = recorded(&ring, "paper-vars");
         let (powered, mut limit) = (recording.powered(&ring), vec![20.0; 48]);
         limit[5] = 0.0;
         let wanted = Feedback {
@@ -470,8 +457,7 @@ mod tests {
     #[test]
     fn a_core_that_cannot_be_loaded_is_at_its_prior() {
         let ring = Ring::booster();
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars");
-        let recording = Recording::read(&folder, &ring).unwrap();
+        let recording = recorded(&ring, "paper-vars");
         let (fresh, mut state) = (estimator(&ring, &recording, FOLLOW).unwrap(), Vec::new());
         let mut core = fresh.clone();
         core.ingest(&mut wire(&recording, &recording.rows[0]).unwrap()).unwrap();

@@ -17,7 +17,7 @@ use crate::fit::Fit;
 use crate::folder::{CorrectorRow, Folder};
 use crate::lattice;
 use crate::straight::DEAD;
-use crate::unknowns::Kind;
+use crate::unknowns::{Kind, gains};
 
 /// A monitor's plane.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,23 +89,8 @@ impl Monitor {
     }
 }
 
-/// Gain and coupling of each row or column: 1 and 0 of one that is not fitted.
-fn fitted_of(fitted: &Fit, lines: usize, of: fn(Kind) -> Option<(usize, usize)>) -> Vec<[f64; 2]> {
-    let mut all = vec![[1.0, 0.0]; lines];
-    for (unknown, &value) in fitted.unknowns.iter().zip(&fitted.values) {
-        if let Some((line, which)) = of(unknown.kind) {
-            all[line][which] = value;
-        }
-    }
-    all
-}
-
 fn monitors(folder: &Folder, fitted: &Fit) -> Vec<Monitor> {
-    let found = fitted_of(fitted, folder.monitors.len(), |kind| match kind {
-        Kind::MonitorGain(row) => Some((row, 0)),
-        Kind::MonitorCoupling(row) => Some((row, 1)),
-        _ => None,
-    });
+    let found = gains((&fitted.unknowns, &fitted.values), folder.monitors.len(), Kind::of_monitor);
     let is_alive = |row: &usize| folder.monitors[*row].is_used && found[*row][0].abs() > DEAD;
     let rows = (0..folder.monitors.len()).filter(is_alive);
     let one = |row: usize| {
@@ -133,11 +118,7 @@ fn sigma(folder: &Folder, fitted: &Fit, row: usize) -> f64 {
 }
 
 fn correctors(folder: &Folder, fitted: &Fit) -> Vec<Corrector> {
-    let found = fitted_of(fitted, folder.correctors.len(), |kind| match kind {
-        Kind::CorrectorGain(column) => Some((column, 0)),
-        Kind::CorrectorCoupling(column) => Some((column, 1)),
-        _ => None,
-    });
+    let found = gains((&fitted.unknowns, &fitted.values), folder.correctors.len(), Kind::of_corrector);
     let used = folder.correctors.iter().enumerate().filter(|(_, one)| one.is_used);
     let one = |(column, one): (usize, &CorrectorRow)| {
         let thin = as_thin(folder, fitted, one);

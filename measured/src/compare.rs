@@ -6,6 +6,8 @@
 
 use std::collections::BTreeMap;
 
+use twin::median;
+
 use crate::alignment::aligned;
 use crate::data::Data;
 use crate::departure::clear;
@@ -174,11 +176,10 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
         let marginal = changed.posterior.marginal(family)?;
         let ordinary = family.with_scale(family.ordinary);
         // errors that are alike along rows and columns tell less than independent ones
-        let mut widening: Vec<f64> =
-            family.members.iter().map(|&member| changed.uncertainty.widening(member)).collect();
-        widening.sort_by(f64::total_cmp);
+        let widening = median(family.members.iter().map(|&member| changed.uncertainty.widening(member)));
+        let widening = widening.expect("a family that is learnt has members");
         let evidence = family.log_evidence(&marginal).zip(ordinary.log_evidence(&marginal));
-        let gain = evidence.map_or(0.0, |(learnt, ordinary)| learnt - ordinary) / widening[widening.len() / 2];
+        let gain = evidence.map_or(0.0, |(learnt, ordinary)| learnt - ordinary) / widening;
         if gain > DECISIVE {
             let width = changed.unknowns[family.members[0]].width;
             let change = family.variance().sqrt() * width;

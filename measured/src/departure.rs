@@ -14,7 +14,7 @@ use crate::chance::deviations;
 use crate::data::Data;
 use crate::descent::{EXACT, descend};
 use crate::error::MeasuredError;
-use crate::fit::{Learnt, with_model_error};
+use crate::fit::with_model_error;
 use crate::model::Model;
 use crate::noise::Noise;
 use crate::released::{Held, Released};
@@ -71,8 +71,7 @@ impl Departures {
         loop {
             let start = descend(model, &unknowns, &data.measured, &data.stated(), (expected.values.clone(), EXACT))?;
             let stated = Noise::stated(data.measured.nrows());
-            let Learnt { here, noise, uncertainty } =
-                with_model_error(model, &unknowns, data, (start, stated), progress)?;
+            let (here, noise, uncertainty) = with_model_error(model, &unknowns, data, (start, stated), progress)?;
             let held = Held::of((&unknowns, &here.values, &here.prediction), (data, &noise), &uncertainty.independent);
             let clear = clear(unknowns.len());
             let of_expected = expected.covariance.as_ref().map(|errors| followed(&uncertainty, &unknowns, errors));

@@ -5,17 +5,16 @@
 //! ([`Hierarchy`]); members that stand out are released, and all is fitted anew ([`search`]); what was found has to predict elements that it was
 //! not fitted to ([`HeldOut`]).
 
-use nalgebra::{DMatrix, DVector};
-use twin::Rf;
+use nalgebra::DMatrix;
+use twin::{Rf, median};
 
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
-use crate::held_out::{Fitted, HeldOut};
+use crate::held_out::HeldOut;
 use crate::hierarchy::Hierarchy;
 use crate::hold::Share;
 use crate::model::Model;
-use crate::normal::Places;
 use crate::search::{NAMED, Outlier, Rival, Search, search};
 use crate::straight::DEAD;
 use crate::unknowns::{self, Groups, Kind, name};
@@ -355,8 +354,7 @@ fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
 fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
     let told = hierarchy.families.iter().filter(|family| family.has_members()).map(|family| {
         let width = hierarchy.unknowns[family.members[0]].width;
-        let mut sigma: Vec<f64> = family.members.iter().map(|&member| hierarchy.uncertainty.sigma[member]).collect();
-        sigma.sort_by(f64::total_cmp);
+        let sigma = median(family.members.iter().map(|&member| hierarchy.uncertainty.sigma[member]));
         Imperfection {
             word: family.kind,
             class: family.class.clone(),
@@ -364,7 +362,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             mean: family.mean(&hierarchy.off_priors()) * width,
             scatter: family.variance().sqrt() * width,
             ordinary: family.ordinary_scatter() * width,
-            sigma: sigma[sigma.len() / 2],
+            sigma: sigma.expect("a family that is learnt has members"),
         }
     });
     told.collect()
@@ -388,38 +386,20 @@ fn limits(folder: &Folder, hierarchy: &Hierarchy, found: &Search) -> Vec<Limit> 
 fn as_loco(folder: &Folder, fitted: &Fit, settings: &Settings) -> Result<HeldOut, MeasuredError> {
     let n = fitted.unknowns.len();
     let prediction = Model::of(folder, &fitted.groups, settings.rf)?.predict(&fitted.unknowns, &fitted.values)?;
-    let places = Places::of(&fitted.unknowns, prediction.matrix.nrows(), prediction.matrix.ncols());
-    let each = fitted.unknowns.iter().zip(&fitted.values);
-    let pull = DVector::from_iterator(n, each.map(|(unknown, value)| (value - unknown.mean) / unknown.width));
-    let width = DVector::from_iterator(n, fitted.unknowns.iter().map(|unknown| unknown.width));
-    let fit = Fitted {
-        places: &places,
-        prediction: &prediction,
-        precision: &DMatrix::identity(n, n),
-        pull: &pull,
-        noise: &fitted.noise,
-        width: &width,
-    };
-    HeldOut::of_fit(&fitted.data, &fitted.data, &fit)
+    HeldOut::of_fit(
+        (&fitted.data, &fitted.data),
+        (&fitted.unknowns, &fitted.values, &prediction),
+        (&DMatrix::identity(n, n), &fitted.noise),
+    )
 }
 
 /// The fit with families and findings on elements held out.
 fn with_families(hierarchy: &Hierarchy, fitted: &Fit) -> Result<HeldOut, MeasuredError> {
-    let (rows, columns) = hierarchy.prediction.matrix.shape();
-    let places = Places::of(&hierarchy.unknowns, rows, columns);
-    let width =
-        DVector::from_iterator(hierarchy.unknowns.len(), hierarchy.unknowns.iter().map(|unknown| unknown.width));
-    let precision = hierarchy.precision();
-    let pull = &precision * hierarchy.off_priors();
-    let fit = Fitted {
-        places: &places,
-        prediction: &hierarchy.prediction,
-        precision: &precision,
-        pull: &pull,
-        noise: &hierarchy.noise,
-        width: &width,
-    };
-    HeldOut::of_fit(&hierarchy.data, &fitted.data, &fit)
+    HeldOut::of_fit(
+        (&hierarchy.data, &fitted.data),
+        (&hierarchy.unknowns, &hierarchy.values, &hierarchy.prediction),
+        (&hierarchy.precision(), &hierarchy.noise),
+    )
 }
 
 /// Monitors' rows and correctors' columns whose residuals are larger than those of the others.

@@ -152,14 +152,6 @@ pub fn sort(folder: &Folder, row: usize) -> &'static str {
     }
 }
 
-/// Deviations of a family's members from what they have in common, with their variances, in widths of the prior.
-pub struct Deviations {
-    /// `d_i`.
-    pub value: Vec<f64>,
-    /// Their posterior variance.
-    pub variance: Vec<f64>,
-}
-
 /// What the data say of the members of a family, everything else adapting: `ln` likelihood `b x - x G x/2`.
 pub struct Marginal {
     /// `G`.
@@ -293,8 +285,8 @@ impl Family {
         self.members.iter().zip(&self.weights).map(|(&member, weight)| weight * number(member)).sum()
     }
 
-    /// Deviations from what they have in common by the posterior of all unknowns.
-    pub fn deviations(&self, values: &DVector<f64>, covariance: &DMatrix<f64>) -> Deviations {
+    /// Deviation of each member from what they have in common by the posterior of all unknowns, and its variance, in widths of the prior.
+    pub fn deviations(&self, values: &DVector<f64>, covariance: &DMatrix<f64>) -> Vec<(f64, f64)> {
         let (shared, common) = (self.shared(), self.common(|i| values[i]));
         let weighted = || self.members.iter().copied().zip(&self.weights);
         let with_others: Vec<f64> =
@@ -302,22 +294,16 @@ impl Family {
         let of_mean =
             shared * shared * self.weights.iter().zip(&with_others).map(|(w, others)| w * others).sum::<f64>()
                 + self.scale * self.scale * shared;
-        let variance = self.members.iter().zip(&with_others);
-        Deviations {
-            value: self.members.iter().map(|&i| values[i] - common).collect(),
-            variance: variance.map(|(&i, others)| covariance[(i, i)] - 2.0 * shared * others + of_mean).collect(),
-        }
+        let variance = |i: usize, others: f64| covariance[(i, i)] - 2.0 * shared * others + of_mean;
+        let members = self.members.iter().zip(&with_others);
+        members.map(|(&i, &others)| (values[i] - common, variance(i, others))).collect()
     }
 
     /// Weights by how far the members are off.
-    pub fn weigh(&mut self, deviations: &Deviations) {
-        let squares = deviations
-            .value
-            .iter()
-            .zip(&deviations.variance)
-            .map(|(value, variance)| value * value + variance.max(0.0));
+    pub fn weigh(&mut self, deviations: &[(f64, f64)]) {
+        let square = |(value, variance): &(f64, f64)| value * value + variance.max(0.0);
         let weight = |square: f64| (TAILS + 1.0) / (TAILS + square / self.scale.powi(2));
-        self.weights = squares.map(weight).collect();
+        self.weights = deviations.iter().map(square).map(weight).collect();
     }
 }
 
@@ -381,6 +367,6 @@ mod tests {
         let family = Family { weights: vec![1.0; 400], freedom: FREEDOM, ..family("corrector_gain", 400, 0.1) };
         let found = family.deviations(&DVector::from_element(400, 0.05), &DMatrix::zeros(400, 400));
         // what is in common is drawn to 0 by (s/f)^2 of 400
-        assert!(found.value.iter().all(|one| one.abs() < 0.05 * 0.01 / 400.0 * 1.01));
+        assert!(found.iter().all(|(value, _)| value.abs() < 0.05 * 0.01 / 400.0 * 1.01));
     }
 }

@@ -65,8 +65,6 @@ pub struct Fit {
     pub noise: Noise,
     /// Measured less predicted [mm], with the dispersion as the last column; 0 where nothing counts.
     pub residual: DMatrix<f64>,
-    /// The same of the fit with the stated noise alone.
-    pub stated_residual: DMatrix<f64>,
     /// Gauss-Newton steps.
     pub steps: usize,
     /// False where the last descent was still moving when its steps were used up: the model is far from the measurement.
@@ -144,11 +142,9 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
     }
     let elements = data.elements();
     let chi2_loco = data.chi2(&as_stated.prediction) / elements as f64;
-    let stated_residual = data.residual(&as_stated.prediction);
     let steps = as_stated.steps;
     let stated = Noise::stated(data.measured.nrows());
-    let Learnt { here, noise, uncertainty } =
-        with_model_error(&model, &unknowns, &data, (as_stated, stated), progress)?;
+    let (here, noise, uncertainty) = with_model_error(&model, &unknowns, &data, (as_stated, stated), progress)?;
     Ok(Fit {
         groups,
         chi2_loco,
@@ -158,7 +154,6 @@ pub fn fit(folder: &Folder, settings: &Settings, progress: &mut dyn FnMut(&str))
         residual: data.residual(&here.prediction),
         data,
         noise,
-        stated_residual,
         steps: steps + here.steps,
         has_ended: here.has_ended,
         values: here.values,
@@ -176,7 +171,8 @@ pub fn memory(unknowns: &[Unknown], (rows, columns): (usize, usize)) -> usize {
     size_of::<f64>() * (8 * n * n + LANES * machine * machine + 20 * rows * columns + 12 * rows * machine)
 }
 
-/// Learn in turn what the model misses in each block and the unknowns, from where a descent with some errors of the elements ended.
+/// Learn in turn what the model misses in each block and the unknowns, from where a descent with some errors of the elements ended: where the last
+/// descent ended, the errors of the elements, and how well the unknowns are known.
 ///
 /// # Errors
 /// [`MeasuredError`].
@@ -186,7 +182,7 @@ pub fn with_model_error(
     data: &Data,
     (mut here, mut noise): (Descent, Noise),
     progress: &mut dyn FnMut(&str),
-) -> Result<Learnt, MeasuredError> {
+) -> Result<(Descent, Noise, Uncertainty), MeasuredError> {
     let mut steps = 0;
     let places = Places::of(unknowns, data.measured.nrows(), data.measured.ncols());
     for round in 1..=ROUNDS {
@@ -203,17 +199,7 @@ pub fn with_model_error(
         }
     }
     let uncertainty = Uncertainty::of(unknowns, &here.prediction, data, &noise)?;
-    Ok(Learnt { here: Descent { steps, ..here }, noise, uncertainty })
-}
-
-/// A descent with what the model misses.
-pub struct Learnt {
-    /// Where it ended.
-    pub here: Descent,
-    /// Errors of the elements.
-    pub noise: Noise,
-    /// How well the unknowns are known.
-    pub uncertainty: Uncertainty,
+    Ok((Descent { steps, ..here }, noise, uncertainty))
 }
 
 impl Fit {

@@ -9,6 +9,7 @@ use crate::linear::Factor;
 use crate::model::Prediction;
 use crate::noise::Noise;
 use crate::normal::{Places, times};
+use crate::unknowns::Unknown;
 
 /// Parts of the rows, and of the columns.
 const PARTS: usize = 3;
@@ -37,32 +38,26 @@ fn jackknife(steps: &[DVector<f64>]) -> DVector<f64> {
     sum.map(|sum| ((parts - 1.0) / parts * sum).sqrt())
 }
 
-/// A fit about which elements are left out.
-pub struct Fitted<'f> {
-    /// Where its unknowns stand.
-    pub places: &'f Places,
-    /// Prediction at its values.
-    pub prediction: &'f Prediction,
-    /// Precision of the prior.
-    pub precision: &'f DMatrix<f64>,
-    /// Slope of `-ln` prior at its values.
-    pub pull: &'f DVector<f64>,
-    /// Errors of the elements.
-    pub noise: &'f Noise,
-    /// Widths of its unknowns, in which the precision is.
-    pub width: &'f DVector<f64>,
-}
-
 impl HeldOut {
-    /// Of the elements that count in some data, by a fit of all elements of its own data.
+    /// Of the elements that count in some data, by a fit of all elements of its own data: with the precision of the prior in widths, and the errors of the
+    /// elements.
     ///
     /// # Errors
     /// [`MeasuredError::Singular`].
-    pub fn of_fit(data: &Data, counted: &Data, fit: &Fitted) -> Result<Self, MeasuredError> {
-        let Fitted { places, prediction, precision, pull, noise, width } = fit;
+    pub fn of_fit(
+        (data, counted): (&Data, &Data),
+        (unknowns, values, prediction): (&[Unknown], &DVector<f64>, &Prediction),
+        (precision, noise): (&DMatrix<f64>, &Noise),
+    ) -> Result<Self, MeasuredError> {
         let residual = data.residual(prediction);
         let weight = data.weight(noise, &residual);
         let (rows, columns) = residual.shape();
+        let places = Places::of(unknowns, rows, columns);
+        let each = |of: fn((&Unknown, &f64)) -> f64| {
+            DVector::from_iterator(unknowns.len(), unknowns.iter().zip(values).map(of))
+        };
+        let width = each(|(unknown, _)| unknown.width);
+        let pull = precision * each(|(unknown, value)| (value - unknown.mean) / unknown.width);
         let whole = places.information(prediction, &weight);
         let slope = places.back(prediction, &weight.component_mul(&residual));
         let (mut left, mut steps) = (residual.clone(), Vec::new());
@@ -70,10 +65,10 @@ impl HeldOut {
             let is_in = |row: usize, column: usize| row % PARTS == part / PARTS && column % PARTS == part % PARTS;
             let own =
                 DMatrix::from_fn(rows, columns, |row, column| f64::from(is_in(row, column)) * weight[(row, column)]);
-            let matrix = times(&whole - places.information(prediction, &own), width) + *precision;
+            let matrix = times(&whole - places.information(prediction, &own), &width) + precision;
             let without = &slope - places.back(prediction, &own.component_mul(&residual));
-            let downhill = without.component_mul(width) - *pull;
-            let step = Factor::of(&matrix).ok_or(MeasuredError::Singular(0))?.solve(&downhill).component_mul(width);
+            let downhill = without.component_mul(&width) - &pull;
+            let step = Factor::of(&matrix).ok_or(MeasuredError::Singular(0))?.solve(&downhill).component_mul(&width);
             let moved = places.forward(prediction, &step);
             left.zip_zip_apply(&moved, &own, |left, moved, own| *left -= if own > 0.0 { moved } else { 0.0 });
             steps.push(step);
@@ -121,16 +116,12 @@ mod tests {
         let prediction = model.predict(&fitted.unknowns, &fitted.values).unwrap();
         let (rows, columns) = prediction.matrix.shape();
         let n = fitted.unknowns.len();
-        let each = fitted.unknowns.iter().zip(&fitted.values);
-        let fit = Fitted {
-            places: &Places::of(&fitted.unknowns, rows, columns),
-            prediction: &prediction,
-            precision: &DMatrix::identity(n, n),
-            pull: &DVector::from_iterator(n, each.map(|(one, value)| (value - one.mean) / one.width)),
-            noise: &fitted.noise,
-            width: &DVector::from_iterator(n, fitted.unknowns.iter().map(|one| one.width)),
-        };
-        let found = HeldOut::of_fit(&fitted.data, &fitted.data, &fit).unwrap();
+        let found = HeldOut::of_fit(
+            (&fitted.data, &fitted.data),
+            (&fitted.unknowns, &fitted.values, &prediction),
+            (&DMatrix::identity(n, n), &fitted.noise),
+        )
+        .unwrap();
         let weight = fitted.data.weight(&fitted.noise, &fitted.residual);
         let mut squares = 0.0;
         for part in 0..PARTS * PARTS {

@@ -4,11 +4,11 @@
 //! momentum compaction is wrong, and decides nothing.
 
 use nalgebra::DVector;
-use twin::{Plane, Rf};
+use twin::{Plane, Rf, median};
 
 use crate::descent::{EXACT, descend};
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Learnt, Settings, fit, with_model_error};
+use crate::fit::{Fit, Settings, fit, with_model_error};
 use crate::folder::Folder;
 use crate::model::{Model, Prediction};
 use crate::unknowns::{Kind, Unknown};
@@ -53,7 +53,7 @@ impl Share {
         let (model, data) = (Model::of(folder, &fitted.groups, settings.rf)?, &fitted.data);
         let weight = data.weight(&fitted.noise, &fitted.residual);
         let start = descend(&model, &unknowns, &data.measured, &weight, (DVector::from_vec(values), EXACT))?;
-        let Learnt { here, noise, uncertainty } =
+        let (here, noise, uncertainty) =
             with_model_error(&model, &unknowns, data, (start, fitted.noise.clone()), progress)?;
         let (value, scatter) = (here.values[place], uncertainty.sigma[place]);
         let likelihoods = data.log_likelihood(&noise, &data.residual(&here.prediction))
@@ -117,13 +117,9 @@ fn dispersion_missed(folder: &Folder, at: &Prediction) -> f64 {
     let [squares, product] =
         [pairs.iter().map(|(_, p)| p * p).sum::<f64>(), pairs.iter().map(|(m, p)| m * p).sum::<f64>()];
     let scale = product / squares;
-    let mut off: Vec<f64> = pairs.iter().map(|(m, p)| (m - scale * p).abs()).collect();
-    off.sort_by(f64::total_cmp);
-    if pairs.is_empty() || squares == 0.0 {
-        return 0.0;
-    }
     let rms = scale.abs() * (squares / pairs.len() as f64).sqrt();
-    1.4826 * off.get(off.len() / 2).copied().unwrap_or(0.0) / rms
+    let off = median(pairs.iter().map(|(m, p)| (m - scale * p).abs())).filter(|_| squares != 0.0);
+    off.map_or(0.0, |off| 1.4826 * off / rms)
 }
 
 #[cfg(test)]

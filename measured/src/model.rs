@@ -14,7 +14,7 @@ use crate::derivative::{ByMachine, Change, Share};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::lattice::{lens_pairs, parts, ring, winding};
-use crate::unknowns::{Focusing, Groups, Kind, Unknown, focusing_along};
+use crate::unknowns::{Focusing, Groups, Kind, Unknown, focusing_along, gains};
 
 /// Millimetres a metre.
 const MILLI: f64 = 1e3;
@@ -138,38 +138,20 @@ impl Model {
     pub fn at(&self, unknowns: &[Unknown], values: &DVector<f64>) -> Ring {
         let mut ring = self.ring.clone();
         for (unknown, &value) in unknowns.iter().zip(values) {
-            match unknown.kind {
-                Kind::Strength(group) | Kind::Added(group) => {
-                    for &element in &self.strengths[group] {
-                        if let Some(k1) = ring.elements[element].kind.gradient_mut() {
-                            *k1 = unknown.kind.gradient(*k1, value);
-                        }
+            if let Kind::Strength(group) | Kind::Added(group) = unknown.kind {
+                for &element in &self.strengths[group] {
+                    if let Some(k1) = ring.elements[element].kind.gradient_mut() {
+                        *k1 = unknown.kind.gradient(*k1, value);
                     }
                 }
-                Kind::Skew(group) => {
-                    for &element in &self.skews[group] {
-                        if let Field::Multipole { k1sl, .. } = &mut ring.elements[element].kind {
-                            *k1sl = value;
-                        }
-                    }
+            }
+            for (element, change, share) in self.thin(unknown.kind) {
+                match (&mut ring.elements[element].kind, change) {
+                    (Field::Multipole { k1sl, .. }, Change::Skew) => *k1sl += share * value,
+                    (Field::Multipole { k1l, .. }, _) => *k1l += share * value,
+                    (Field::Wiggler { focusing }, _) => *focusing += share * value,
+                    _ => {}
                 }
-                Kind::Gradient(group) => {
-                    for &element in &self.gradients[group] {
-                        if let Field::Multipole { k1l, .. } = &mut ring.elements[element].kind {
-                            *k1l = value;
-                        }
-                    }
-                }
-                Kind::Wiggler(_) | Kind::Moment(..) => {
-                    for (element, _, share) in self.along(unknown.kind) {
-                        match &mut ring.elements[element].kind {
-                            Field::Wiggler { focusing } => *focusing += share * value,
-                            Field::Multipole { k1l, .. } => *k1l += share * value,
-                            _ => {}
-                        }
-                    }
-                }
-                _ => {}
             }
         }
         ring
@@ -279,22 +261,23 @@ impl Model {
 
     /// What each unknown of a magnet changes, with the gradients of the factors.
     fn changes(&self, gradients: &[Vec<f64>]) -> Vec<Vec<Share>> {
-        let each =
-            |group: &Vec<usize>, change: Change| -> Vec<Share> { group.iter().map(|&at| (at, change, 1.0)).collect() };
         let strengths = self.strengths.iter().zip(gradients).map(|(group, gradients)| {
             let each = group.iter().zip(gradients);
             each.map(|(&at, &per_unit)| (at, Change::Normal, per_unit)).collect()
         });
-        let skews = self.skews.iter().map(|group| each(group, Change::Skew));
-        let gradients = self.gradients.iter().map(|group| each(group, Change::Normal));
-        let along = focusing_along(self.straights.len()).map(|kind| self.along(kind));
-        strengths.chain(skews).chain(gradients).chain(along).collect()
+        let skews = (0..self.skews.len()).map(Kind::Skew);
+        let gradients = (0..self.gradients.len()).map(Kind::Gradient);
+        let thin = skews.chain(gradients).chain(focusing_along(self.straights.len()));
+        strengths.chain(thin.map(|kind| self.thin(kind))).collect()
     }
 
-    /// What an unknown changes along its straight: all lenses alike, or in proportion to their distances `s` from the middle, `s / sum of s^2` for a
-    /// moment of 1; nothing of any other unknown.
-    fn along(&self, kind: Kind) -> Vec<Share> {
+    /// What an unknown changes of thin elements: each of its group, or along its straight all lenses alike, or in proportion to their distances `s` from the
+    /// middle, `s / sum of s^2` for a moment of 1; nothing of any other unknown.
+    fn thin(&self, kind: Kind) -> Vec<Share> {
+        let each = |group: &[usize], change| group.iter().map(|&at| (at, change, 1.0)).collect();
         let (group, change) = match kind {
+            Kind::Skew(group) => return each(&self.skews[group], Change::Skew),
+            Kind::Gradient(group) => return each(&self.gradients[group], Change::Normal),
             Kind::Wiggler(group) | Kind::Moment(Focusing::Wiggler, group) => (group, Change::Vertical),
             Kind::Moment(Focusing::Gradient, group) => (group, Change::Normal),
             _ => return Vec::new(),
@@ -321,29 +304,13 @@ impl Model {
     }
 
     fn instruments(&self, unknowns: &[Unknown], values: &DVector<f64>) -> Instruments {
-        let mut all = Instruments {
-            monitors: vec![[1.0, 0.0]; self.monitors.len()],
-            correctors: vec![[1.0, 0.0]; self.correctors.len()],
-            rf: 1.0,
-            held_frequency: None,
-        };
-        for (unknown, &value) in unknowns.iter().zip(values) {
-            match unknown.kind {
-                Kind::MonitorGain(row) => all.monitors[row][0] = value,
-                Kind::MonitorCoupling(row) => all.monitors[row][1] = value,
-                Kind::CorrectorGain(column) => all.correctors[column][0] = value,
-                Kind::CorrectorCoupling(column) => all.correctors[column][1] = value,
-                Kind::RfScale => all.rf = value,
-                Kind::HeldFrequency => all.held_frequency = Some(value),
-                Kind::Strength(_)
-                | Kind::Added(_)
-                | Kind::Skew(_)
-                | Kind::Gradient(_)
-                | Kind::Wiggler(_)
-                | Kind::Moment(..) => {}
-            }
+        let value_of = |kind: Kind| unknowns.iter().position(|unknown| unknown.kind == kind).map(|at| values[at]);
+        Instruments {
+            monitors: gains((unknowns, values), self.monitors.len(), Kind::of_monitor),
+            correctors: gains((unknowns, values), self.correctors.len(), Kind::of_corrector),
+            rf: value_of(Kind::RfScale).unwrap_or(1.0),
+            held_frequency: value_of(Kind::HeldFrequency),
         }
-        all
     }
 }
 
@@ -413,7 +380,7 @@ mod tests {
         assert!(model.straights.len() > 4, "{}", model.straights.len());
         for (group, pairs) in model.straights.iter().enumerate() {
             let moments = |kind: Kind| {
-                let shares = model.along(kind).into_iter().zip(pairs);
+                let shares = model.thin(kind).into_iter().zip(pairs);
                 shares.fold([0.0; 2], |[sum, first], ((_, _, share), pair)| [sum + share, first + share * pair.off])
             };
             let along =

@@ -6,10 +6,9 @@ use core::ops::AddAssign;
 
 use nalgebra::{DMatrix, DVector};
 
-use crate::error::MeasuredError;
-use crate::linear::{add_square, in_lanes, inverse, lower_product};
+use crate::linear::{add_square, in_lanes, lower_product};
 use crate::model::Prediction;
-use crate::unknowns::{Kind, Unknown};
+use crate::unknowns::Unknown;
 
 /// Where the unknowns of each row and column stand.
 pub struct Places {
@@ -24,20 +23,15 @@ impl Places {
     pub fn of(unknowns: &[Unknown], rows: usize, columns: usize) -> Self {
         let none = |lines: usize| vec![[None; 2]; lines];
         let mut places = Self { unknowns: unknowns.len(), machine: 0, rows: none(rows), columns: none(columns) };
-        for (at, unknown) in unknowns.iter().enumerate() {
-            match unknown.kind {
-                Kind::Strength(_)
-                | Kind::Added(_)
-                | Kind::Skew(_)
-                | Kind::Gradient(_)
-                | Kind::Wiggler(_)
-                | Kind::Moment(..)
-                | Kind::HeldFrequency => places.machine += 1,
-                Kind::MonitorGain(row) => places.rows[row][0] = Some(at),
-                Kind::MonitorCoupling(row) => places.rows[row][1] = Some(at),
-                Kind::CorrectorGain(column) => places.columns[column][0] = Some(at),
-                Kind::CorrectorCoupling(column) => places.columns[column][1] = Some(at),
-                Kind::RfScale => places.columns[columns - 1][0] = Some(at),
+        for (at, Unknown { kind, .. }) in unknowns.iter().enumerate() {
+            if kind.is_of_machine() {
+                places.machine += 1;
+            } else if let Some((row, which)) = kind.of_monitor() {
+                places.rows[row][which] = Some(at);
+            } else if let Some((column, which)) = kind.of_corrector() {
+                places.columns[column][which] = Some(at);
+            } else {
+                places.columns[columns - 1][0] = Some(at); // the RF scale
             }
         }
         places
@@ -232,11 +226,4 @@ pub fn times(mut matrix: DMatrix<f64>, width: &DVector<f64>) -> DMatrix<f64> {
         column *= of_column;
     }
     matrix
-}
-
-/// Covariance of the unknowns, with what the elements say of them, `J^T W J`.
-pub fn covariance(unknowns: &[Unknown], information: DMatrix<f64>) -> Result<DMatrix<f64>, MeasuredError> {
-    let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
-    let inverse = inverse(&in_widths(information, &width)).ok_or(MeasuredError::Singular(0))?;
-    Ok(times(inverse, &width))
 }

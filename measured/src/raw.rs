@@ -5,6 +5,7 @@ use std::path::Path;
 use nalgebra::DMatrix;
 use serde::Deserialize;
 use twin::limits::{self, Budget, MEMORY};
+use twin::median;
 
 use crate::error::MeasuredError;
 use crate::folder::{Folder, number, table, text};
@@ -103,9 +104,7 @@ impl RawOrbits {
             let squares: f64 = read.windows(2).map(|pair| (pair[1] - pair[0]).powi(2)).sum();
             (read.len() > 1).then(|| (squares / (read.len() - 1) as f64).sqrt())
         };
-        let mut all: Vec<f64> = monitors.iter().filter_map(|&row| steps(row)).collect();
-        all.sort_by(f64::total_cmp);
-        all.get(all.len() / 2).copied()
+        median(monitors.iter().filter_map(|&row| steps(row)))
     }
 }
 

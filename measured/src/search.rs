@@ -118,6 +118,7 @@ fn expected(kind: Kind) -> f64 {
 }
 
 /// Members of families, and how far they are off.
+#[derive(Clone)]
 struct Members {
     /// Numbers among the unknowns.
     unknowns: Vec<usize>,
@@ -219,8 +220,7 @@ impl Members {
                 let deviations = one.deviations(&posterior.values, &posterior.covariance);
                 unknowns.extend(&one.members);
                 family.extend(one.members.iter().map(|_| number));
-                let squared =
-                    deviations.value.iter().zip(&deviations.variance).map(|(value, variance)| value * value + variance);
+                let squared = deviations.iter().map(|(value, variance)| value * value + variance);
                 let normal = one.variance() / one.scale.powi(2);
                 let weighted = squared.zip(&one.weights).map(|(square, weight)| normal * square * weight);
                 squares.extend(
@@ -324,20 +324,11 @@ impl Members {
     fn clone_released(&self, member: usize) -> Self {
         let power = self.curvature[(member, member)] + 1.0;
         let across = self.curvature.column(member).into_owned();
-        let mut released = self.released.clone();
-        released[member] = true;
-        Self {
-            slope: &self.slope - &across * (self.slope[member] / power),
-            curvature: &self.curvature - &across * across.transpose() / power,
-            released,
-            unknowns: self.unknowns.clone(),
-            family: self.family.clone(),
-            squares: self.squares.clone(),
-            held: self.held.clone(),
-            scatter: self.scatter.clone(),
-            widening: self.widening.clone(),
-            prior: self.prior.clone(),
-        }
+        let mut others = self.clone();
+        others.released[member] = true;
+        others.slope -= &across * (self.slope[member] / power);
+        others.curvature -= &across * across.transpose() / power;
+        others
     }
 }
 

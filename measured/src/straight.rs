@@ -5,6 +5,7 @@
 //! Last, instruments are left out that read or kick nothing: what the model misses is not learnt from them.
 
 use nalgebra::DMatrix;
+use twin::median;
 
 use crate::error::MeasuredError;
 use crate::fit::{Fit, Settings, Start, fit};
@@ -109,12 +110,8 @@ fn expect_unit(folder: &Folder, settings: &Settings) -> Result<(), MeasuredError
     };
     let (rows, columns) = folder.matrix.shape();
     let elements: Vec<(usize, usize)> = (0..rows * columns).map(|k| (k % rows, k / rows)).filter(counts).collect();
-    let median = |matrix: &DMatrix<f64>| {
-        let mut sizes: Vec<f64> = elements.iter().map(|&at| matrix[at].abs()).collect();
-        sizes.sort_by(f64::total_cmp);
-        sizes.get(sizes.len() / 2).copied().unwrap_or_default()
-    };
-    let [measured, expected] = [&folder.matrix, &written].map(median);
+    let size = |matrix: &DMatrix<f64>| median(elements.iter().map(|&at| matrix[at].abs())).unwrap_or_default();
+    let [measured, expected] = [&folder.matrix, &written].map(size);
     // a dead measurement is said as such
     if measured == 0.0 || (DEAD * expected..expected / DEAD).contains(&measured) {
         return Ok(());

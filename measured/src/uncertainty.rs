@@ -16,10 +16,10 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::linear::{product, transposed_product};
+use crate::linear::{inverse, product, transposed_product};
 use crate::model::Prediction;
 use crate::noise::Noise;
-use crate::normal::{Places, covariance};
+use crate::normal::{Places, in_widths, times};
 use crate::unknowns::Unknown;
 
 /// Of the unknowns of a fit.
@@ -48,7 +48,9 @@ impl Uncertainty {
         let residual = data.residual(at);
         let places = Places::of(unknowns, residual.nrows(), residual.ncols());
         let information = places.information(at, &data.information(noise));
-        let independent = covariance(unknowns, information.clone())?;
+        let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
+        let inverse = inverse(&in_widths(information.clone(), &width)).ok_or(MeasuredError::Singular(0))?;
+        let independent = times(inverse, &width);
         Ok(Self::about((&places, at), (independent, information), (data, noise)))
     }
 

@@ -1,5 +1,7 @@
 //! What is fitted: magnets, and the instruments that see them.
 
+use nalgebra::DVector;
+
 use crate::folder::{Folder, Row};
 
 /// One fitted number.
@@ -85,6 +87,24 @@ impl Kind {
             | Self::CorrectorGain(_)
             | Self::CorrectorCoupling(_)
             | Self::RfScale => false,
+        }
+    }
+
+    /// Row of the monitor whose gain it is, 0, or coupling, 1.
+    pub fn of_monitor(self) -> Option<(usize, usize)> {
+        match self {
+            Self::MonitorGain(row) => Some((row, 0)),
+            Self::MonitorCoupling(row) => Some((row, 1)),
+            _ => None,
+        }
+    }
+
+    /// Column of the corrector whose gain it is, 0, or coupling, 1.
+    pub fn of_corrector(self) -> Option<(usize, usize)> {
+        match self {
+            Self::CorrectorGain(column) => Some((column, 0)),
+            Self::CorrectorCoupling(column) => Some((column, 1)),
+            _ => None,
         }
     }
 
@@ -236,6 +256,21 @@ pub fn unknowns(folder: &Folder, groups: &Groups, coupling: bool, widths: &Width
     let instruments = instruments
         .filter(|one| coupling || !matches!(one.kind, Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_)));
     magnets.chain(skews).chain(instruments).chain(rf).collect()
+}
+
+/// Gain and coupling of each row or column: 1 and 0 of one that is not fitted.
+pub fn gains(
+    (unknowns, values): (&[Unknown], &DVector<f64>),
+    lines: usize,
+    place: fn(Kind) -> Option<(usize, usize)>,
+) -> Vec<[f64; 2]> {
+    let mut all = vec![[1.0, 0.0]; lines];
+    for (unknown, &value) in unknowns.iter().zip(values) {
+        if let Some((line, which)) = place(unknown.kind) {
+            all[line][which] = value;
+        }
+    }
+    all
 }
 
 /// True where a group of magnets has another one, and more.

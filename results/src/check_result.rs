@@ -10,7 +10,7 @@ use inference::{BaseModel, BatchFit, Campaign, Imperfection, Lack, Recording, Tu
 use schemars::JsonSchema;
 use serde::Serialize;
 use training::rooms::largest;
-use twin::{Hold, Optics, Ring, Tunes};
+use twin::{Hold, Optics, Ring, Tunes, median};
 
 use crate::campaign::{campaign, not_modelled, strays};
 use crate::error::CommandError;
@@ -201,12 +201,6 @@ impl Noise {
         };
         Self { x: plane(0), y: plane(1) }
     }
-}
-
-fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
 }
 
 /// Whether the core takes it: its tables, the setup, and the first frame.

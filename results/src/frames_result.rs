@@ -7,7 +7,7 @@ use inference::recording::Recording;
 use measured::{Calibrated, Fit, Folder, RawOrbits, calibrated};
 use schemars::JsonSchema;
 use serde::Serialize;
-use twin::Plane;
+use twin::{Plane, median};
 
 use crate::output::fill;
 
@@ -53,11 +53,9 @@ impl Written {
     pub fn of(out: &Path, recording: &Recording, calibrated: &Calibrated, raw: &RawOrbits, missing: f64) -> Self {
         let noise = |plane: Plane| {
             let of_plane = calibrated.monitors.iter().filter(|one| one.plane == plane);
-            let mut sigma: Vec<f64> = of_plane.clone().map(|one| one.sigma).collect();
-            sigma.sort_by(f64::total_cmp);
-            let rows: Vec<usize> = of_plane.map(|one| one.row).collect();
+            let rows: Vec<usize> = of_plane.clone().map(|one| one.row).collect();
             PlaneNoise {
-                sigma_um: 1e3 * sigma.get(sigma.len() / 2).copied().unwrap_or(0.0),
+                sigma_um: 1e3 * median(of_plane.map(|one| one.sigma)).unwrap_or(0.0),
                 drift_um: raw.drift(&rows).map(|drift| 1e3 * drift),
             }
         };

@@ -23,6 +23,7 @@ mod check_result;
 mod compare;
 mod diagnosis_page;
 mod diagnosis_result;
+mod draws;
 mod error;
 mod finite;
 mod fit;
@@ -46,6 +47,7 @@ pub use campaign::{campaign, expect_modelled, not_modelled, recording, strays, t
 pub use check_result::CheckResult;
 pub use compare::{compare_matrices, compare_recordings};
 pub use diagnosis_result::{DiagnosisResult, diagnosis_page};
+pub use draws::save_draws;
 pub use error::CommandError;
 pub use fit::{Design, FitModel, fit_by_draws, fit_by_steps, fit_page};
 pub use fit_result::{FitResult, Monitor, Timing, Tunes, TunesMeasured, Var, state_word};

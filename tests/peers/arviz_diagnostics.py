@@ -21,7 +21,7 @@ import arviz as az
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 SEED, CHAINS, DRAWS = 20, 4, 400
 STATS = ["lp__", "accept_stat__", "stepsize__", "treedepth__", "n_leapfrog__", "divergent__", "energy__"]
-FIGURES = ["r_hat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd"]
+FIGURES = ["r_hat", "ess_bulk", "ess_tail", "mcse_mean"]
 
 
 def main():
@@ -117,7 +117,6 @@ def figures(name, values):
         az.ess(values, method="bulk"),
         az.ess(values, method="tail"),
         az.mcse(values, method="mean"),
-        az.mcse(values, method="sd"),
     ]
     return [name, *(repr(float(figure)) for figure in row)]
 

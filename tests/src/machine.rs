@@ -122,7 +122,7 @@ impl Machine {
     /// If the core is not the Booster's.
     pub fn drawn(core: &Core, seed: u64) -> Self {
         let mut random = Random::new(seed);
-        let prior = core.prior(0);
+        let prior = core.setup.priors[core.tables.prior_group(0)];
         let mut surrogate = Box::new(Green::BLANK);
         core.tables.fill(&mut *surrogate).expect("tables of the Booster");
         let setup = core.setup.in_room(&LAYOUT);

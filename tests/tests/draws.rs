@@ -1,18 +1,35 @@
 //! Convergence diagnostics against ArviZ 0.23, on chains that have one fault each (`tests/peers/arviz_diagnostics.py`).
 
-use inference::mcse_sd;
-use inference::{Draws, Summary};
+use inference::{Chain, DrawStats, Draws, Summary};
 use system_tests::repository;
 
 /// Sums in another order, and ArviZ's autocovariance by FFT; the largest measured is 3e-13, of a quantity that is small
 /// against its mean.
 const ROUNDING: f64 = 1e-11;
 
-/// ArviZ on a quantity: name, then `r_hat`, `ess_bulk`, `ess_tail`, `mcse_mean` and `mcse_sd`.
-type Row = (String, [f64; 5]);
+/// ArviZ on a quantity: name, then `r_hat`, `ess_bulk`, `ess_tail` and `mcse_mean`.
+type Row = (String, [f64; 4]);
 
 fn draws() -> Draws {
-    Draws::read(&repository("tests/golden/draws")).unwrap()
+    let (names, chains): (Vec<_>, Vec<_>) = (1..=4).map(chain).unzip();
+    Draws { names: names[0].clone(), chains }
+}
+
+/// Names of the quantities and their draws, from a CSV file as CmdStan writes it: the sampler's statistics come first.
+fn chain(number: usize) -> (Vec<String>, Chain) {
+    let text = std::fs::read_to_string(repository(&format!("tests/golden/draws/chain-{number}.csv"))).unwrap();
+    let mut lines = text.lines().map(|line| line.split(','));
+    let names = lines.next().unwrap().skip(7).map(String::from).collect();
+    let mut chain = Chain::default();
+    for cells in lines {
+        let mut cells = cells.map(|cell| cell.parse().unwrap());
+        let [lp, acceptance, step_size, depth, leapfrogs, divergent, energy] =
+            core::array::from_fn(|_| cells.next().unwrap());
+        let (depth, leapfrogs, divergent) = (depth as u64, leapfrogs as u64, divergent == 1.0);
+        chain.stats.push(DrawStats { lp, acceptance, step_size, depth, leapfrogs, divergent, energy });
+        chain.draws.push(cells.collect());
+    }
+    (names, chain)
 }
 
 fn of_arviz() -> Vec<Row> {
@@ -25,16 +42,14 @@ fn of_arviz() -> Vec<Row> {
     text.lines().skip(1).map(row).collect()
 }
 
-fn ours(draws: &Draws, index: usize, summary: &Summary) -> Row {
+fn ours(summary: &Summary) -> Row {
     let Summary { name, r_hat, ess_bulk, ess_tail, mcse_mean, .. } = summary;
-    (name.clone(), [*r_hat, *ess_bulk, *ess_tail, *mcse_mean, mcse_sd(&draws.quantity(index))])
+    (name.clone(), [*r_hat, *ess_bulk, *ess_tail, *mcse_mean])
 }
 
 #[test]
 fn diagnostics_are_those_of_arviz() {
-    let draws = draws();
-    let ours =
-        draws.summary().iter().enumerate().map(|(index, summary)| ours(&draws, index, summary)).collect::<Vec<_>>();
+    let ours: Vec<Row> = draws().summary().iter().map(ours).collect();
     let theirs = of_arviz();
     assert_eq!(ours.len(), theirs.len());
     for ((name, ours), (their_name, theirs)) in ours.iter().zip(&theirs) {
@@ -45,7 +60,7 @@ fn diagnostics_are_those_of_arviz() {
 }
 
 #[test]
-fn statistics_of_the_sampler_are_read() {
+fn divergences_of_the_golden_chains_are_counted() {
     let draws = draws();
     assert_eq!((draws.chains.len(), draws.divergences()), (4, 1));
     assert!(draws.chains[3].stats[100].divergent);

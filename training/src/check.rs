@@ -3,7 +3,7 @@
 use estimator::Tables as _;
 use estimator::surrogate::Network as Core;
 use nalgebra::DMatrix;
-use twin::{Hold, Optics, Parameter, ParameterPrior, Ring, sobol};
+use twin::{Hold, Optics, Parameter, ParameterPrior, Ring, median, sobol};
 
 use crate::instruments::Instruments;
 use crate::network::layers::Network;
@@ -146,7 +146,7 @@ fn compare(
         bytes: about(plane).bytes,
         samples: each[plane].len(),
         rms: errors[plane].rms(),
-        median: median(&mut each[plane]),
+        median: median(each[plane].iter().copied()).unwrap_or(0.0),
         max: errors[plane].largest,
         stated_rms: about(plane).stated_rms,
         tune_max: errors[plane].tune,
@@ -209,12 +209,6 @@ impl Errors {
     fn rms(&self) -> f64 {
         (self.squares / self.count.max(1) as f64).sqrt()
     }
-}
-
-/// The middle one, the upper of two; 0 of none.
-fn median(of: &mut [f64]) -> f64 {
-    of.sort_by(f64::total_cmp);
-    of.get(of.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// The twin at given vars; none where it is not stable.

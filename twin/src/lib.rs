@@ -19,6 +19,7 @@ mod lattice;
 pub mod limits;
 mod map;
 mod matrix;
+mod median;
 mod modes;
 mod orbit;
 mod response;
@@ -44,6 +45,7 @@ pub use lattice::{
     Parameter, ParameterPrior, Particle, Plane, Polynomial, Quadrupole, RampPoint, Ring, Supply, Weights, unreadable,
 };
 pub use map::Phase;
+pub use median::median;
 pub use orbit::{ClosedOrbit, Hold, OrbitError};
 pub use response::{Gradient, Observer, Optics, Place, Source};
 pub use ripple::ripple_of_misaligned;

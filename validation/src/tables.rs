@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use diagnosis::Verdict;
 use schemars::JsonSchema;
 use serde::Serialize;
+use twin::median;
 
 use crate::case::Class;
 use crate::mixes::{Calibration, Reliability};
@@ -174,9 +175,9 @@ impl Tables {
             calibration: Calibration::all(outcomes),
             amplitudes: (pulls.len(), mean(pulls.iter().map(|p| p * p)), [inside(1.0), inside(2.0)]),
             places: Share::new(covered.iter().filter(|covered| **covered).count(), covered.len()),
-            nees: [0, 1].map(|i| median(right().map(|o| o.nees[i]).collect())),
-            heldout: median(right().map(|o| o.heldout.0 / o.heldout.1).collect()),
-            seconds: [median(seconds.clone()), seconds.iter().copied().fold(0.0, f64::max)],
+            nees: [0, 1].map(|i| median(right().map(|o| o.nees[i])).unwrap_or(0.0)),
+            heldout: median(right().map(|o| o.heldout.0 / o.heldout.1)).unwrap_or(0.0),
+            seconds: [median(seconds.iter().copied()).unwrap_or(0.0), seconds.iter().copied().fold(0.0, f64::max)],
         }
     }
 
@@ -374,9 +375,4 @@ fn range([from, to]: &[f64; 2]) -> String {
 fn mean(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
     if count > 0.0 { sum / count } else { 0.0 }
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }

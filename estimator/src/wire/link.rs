@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::packet::{self, LENGTH, VARINT_16, VARINT_32, VARINT_64};
 use super::{CurrentCode, FrameError, ParcelError, listed};
-use crate::estimate::{Estimate, Health, MonitorState, Remarks};
+use crate::estimate::{Estimate, Remarks};
 use crate::estimator::{GROUPS, IngestError, Setup};
 use crate::mask::Mask;
 use crate::ramp::RAMP_POINTS;
@@ -301,41 +301,6 @@ impl<const B: usize, const N: usize, const W: usize> Answer<B, N, W> {
         + LENGTH + B * (1 + 8 + VARINT_32) // health
         + 3 * VARINT_32 + VARINT_64 // the frame, and how many
         + 2 * 4 + 2 * 5 + 2 * 4 + 4 + VARINT_32; // nis, log_evidence, tunes, setting and the param let loose, linearised and other remarks, slices
-
-    /// The estimate, if every list is whole.
-    pub fn estimate(&self) -> Option<Estimate<B, N, W>> {
-        let list = |values: &Vec<f32, N>| <[f32; N]>::try_from(values.as_slice()).ok();
-        let mut health = [Health::default(); B];
-        if self.health.len() != health.len() {
-            return None;
-        }
-        for (to, &(state, noise, weighted_as, rejected)) in health.iter_mut().zip(&self.health) {
-            *to = Health { state: MonitorState::from_code(state)?, noise, weighted_as, rejected };
-        }
-        Some(Estimate {
-            sequence: self.sequence,
-            time_us: self.time_us,
-            frames: self.frames,
-            rejected_frames: self.rejected_frames,
-            mean: list(&self.mean)?,
-            sigma: list(&self.sigma)?,
-            map_params: list(&self.map_params)?,
-            centre: list(&self.centre)?,
-            params_sigma: list(&self.params_sigma)?,
-            clipped: Mask::from_words(&self.clipped),
-            nis: self.nis,
-            accepted: Mask::from_words(&self.accepted),
-            rejected: Mask::from_words(&self.rejected),
-            confirmed: Mask::from_words(&self.confirmed),
-            restarted: Mask::from_words(&self.restarted),
-            tune_innovation: self.tune_innovation,
-            setting: self.setting,
-            log_evidence: self.log_evidence,
-            linearised: self.linearised,
-            remarks: self.remarks,
-            health,
-        })
-    }
 }
 
 impl<const B: usize, const C: usize, const F: usize> Setup<B, C, F> {

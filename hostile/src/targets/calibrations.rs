@@ -1,10 +1,9 @@
-//! Results that are read again: a fit to export, tables of a model, draws.
+//! Results that are read again: a fit to export, tables of a model, an effect in words.
 
 use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use inference::{Chain, DrawStats, Draws};
 use lattices::export::{self, Calibration, Format, Lattice};
 use results::StatedModel;
 use serde_json::json;
@@ -14,10 +13,9 @@ use twin::{Effect, Ring};
 
 use super::{Target, with_file};
 
-pub(super) const TARGETS: [Target; 4] = [
+pub(super) const TARGETS: [Target; 3] = [
     Target { name: "calibration", seeds: || vec![fit()], read: calibration },
     Target { name: "model_file", seeds: model_files, read: model_file },
-    Target { name: "draws", seeds: || vec![chain()], read: draws },
     Target { name: "effect", seeds: effects, read: effect },
 ];
 
@@ -53,18 +51,6 @@ fn model_files() -> Vec<Vec<u8>> {
 
 fn model_file(bytes: &[u8]) -> bool {
     with_file("model", bytes, |path| results::model_file::read(path, &RING).is_ok())
-}
-
-fn chain() -> Vec<u8> {
-    let chain = Chain { draws: vec![vec![1.001, 0.998]; 5], stats: vec![DrawStats::default(); 5] };
-    let folder = tempfile::tempdir().expect("the system has room for a file");
-    let draws = Draws { names: vec!["A2".into(), "D8".into()], chains: vec![chain] };
-    let files = draws.write(folder.path()).expect("the system has room for a file");
-    fs::read(&files[0]).expect("it was written")
-}
-
-fn draws(bytes: &[u8]) -> bool {
-    with_file("chain-1.csv", bytes, |path| Draws::read(path.parent().expect("it is in a folder")).is_ok())
 }
 
 fn effects() -> Vec<Vec<u8>> {

@@ -168,8 +168,8 @@ fn answers() -> Vec<Vec<u8>> {
 
 /// What the host makes of a reply.
 fn reply(wire: &[u8]) -> bool {
-    match firmware_sim::Reply::<Estimator>::decode(&mut wire.to_vec()).1 {
-        Ok(Reply::Estimate(estimate)) => estimate.estimate().is_some(),
+    match largest::Reply::decode(&mut wire.to_vec()).1 {
+        Ok(Reply::Estimate(answer)) => Estimate::of_answer(&answer).is_some(),
         reply => reply.is_ok(),
     }
 }

@@ -67,11 +67,6 @@ impl Exclusions {
         self.reasons[(frame, b)].is_none()
     }
 
-    /// Why it does not.
-    pub fn reason(&self, frame: usize, b: usize) -> Option<Excluded> {
-        self.reasons[(frame, b)]
-    }
-
     /// True if a reading was put aside: it is there, and does not count.
     pub fn is_aside(&self, frame: usize, b: usize) -> bool {
         self.reasons[(frame, b)].is_some_and(|reason| !reason.is_missing())
@@ -151,12 +146,11 @@ mod tests {
         exclusions.exclude(0, 0, Excluded::Jump);
         exclusions.exclude_frame(0, Excluded::LostBeam);
         exclusions.exclude_frame(1, Excluded::LostBeam);
-        let reasons = |exclusions: &Exclusions| [0, 1].map(|frame| [0, 1].map(|b| exclusions.reason(frame, b)));
         use Excluded::{Dead, Jump, LostBeam, Missing};
-        assert_eq!(reasons(&exclusions), [[Some(Jump), Some(Missing)], [Some(LostBeam); 2]]);
+        assert_eq!(exclusions.reasons, dmatrix![Some(Jump), Some(Missing); Some(LostBeam), Some(LostBeam)]);
         exclusions.lift(1, 1);
         exclusions.set_dead(1);
-        assert_eq!(reasons(&exclusions), [[Some(Jump), Some(Dead)], [Some(LostBeam), None]]);
+        assert_eq!(exclusions.reasons, dmatrix![Some(Jump), Some(Dead); Some(LostBeam), None]);
         assert_eq!(exclusions.counting(), dmatrix![false, false; false, true]);
         assert!(exclusions.is_aside(0, 0) && !exclusions.is_aside(0, 1) && !exclusions.is_aside(1, 1));
     }

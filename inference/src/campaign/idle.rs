@@ -4,6 +4,7 @@
 //! most frames is idle in these; every other counts from 0.
 
 use nalgebra::DMatrix;
+use twin::median;
 
 /// Where each corrector stands while it is idle, and the scatter there.
 #[derive(Debug, Clone, PartialEq)]
@@ -32,8 +33,9 @@ impl Idle {
     pub fn from_kicks(kick: &DMatrix<f64>, nominal_kick: f64) -> Self {
         let least = IDLE * nominal_kick;
         let one = |kick: &[f64]| {
-            let level = median(kick.iter().copied());
-            let scatter = SCATTERS / MEDIAN * median(kick.iter().map(|kick| (kick - level).abs()));
+            let level = median(kick.iter().copied()).unwrap_or_default();
+            let far = median(kick.iter().map(|kick| (kick - level).abs())).unwrap_or_default();
+            let scatter = SCATTERS / MEDIAN * far;
             let idle = kick.iter().filter(|kick| (*kick - level).abs() <= scatter.max(least)).count();
             let has_level = scatter <= SCATTER * nominal_kick && idle as f64 >= MOSTLY * kick.len() as f64;
             if has_level { (level, scatter) } else { (0.0, 0.0) }
@@ -47,13 +49,6 @@ impl Idle {
         let reach = self.scatter[corrector].max(self.least);
         Some(kick - self.level[corrector]).filter(|moved| moved.abs() > reach)
     }
-}
-
-/// Median, 0 of none.
-fn median(values: impl Iterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
 #[cfg(test)]

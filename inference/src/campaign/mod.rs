@@ -49,8 +49,6 @@ pub struct Campaign {
     pub prior: Prior,
     /// What drove the beam in each frame.
     pub drives: Vec<Drive>,
-    /// Share of the scatter of the correctors' read-backs that the beam follows: 1 for fluctuating currents, 0 for noise of the read-backs.
-    pub followed: f64,
     /// Time of each frame, from -1 to 1.
     pub time: Vec<f64>,
     /// Mean `ln` of each supply's factor [F].
@@ -71,9 +69,7 @@ pub struct Campaign {
     pub screened: Screened,
     /// The params that the screening ends with: a first guess.
     pub params: DVector<f64>,
-    /// Each monitor's baseline at these [B] [m], for each time in the cycle; none without readings.
-    pub baselines: Vec<Option<f64>>,
-    /// Rms of these in x and y [m].
+    /// Rms of the baselines at these, in x and y [m].
     pub orbit: [f64; 2],
     /// Rms change of a misaligned ring's orbit per unit of RF offset and of rms orbit, in x and y, at `params`: towards an integer tune
     /// it grows, to twice that of the Booster's design at 4.87.
@@ -162,7 +158,6 @@ impl Campaign {
             held,
             prior,
             drives,
-            followed,
             supplies,
             times,
             settings,
@@ -170,7 +165,6 @@ impl Campaign {
             tunes,
             screened,
             params,
-            baselines,
             spurious,
             field: fields(recording),
             of_field,
@@ -256,11 +250,6 @@ impl Campaign {
     /// [`OrbitError`] if there is no stable ring.
     pub(crate) fn linearised(&self, base: BaseModel, params: &DVector<f64>) -> Result<AtTimes, OrbitError> {
         AtTimes::new((&self.held, base), params, &self.supplies, &self.drives, &self.times)
-    }
-
-    /// Rms of the baselines that are known, in x and y [m].
-    pub(crate) fn rms_by_plane(&self, baselines: &[Option<f64>]) -> [f64; 2] {
-        rms_by_plane(&self.ring, baselines)
     }
 
     /// True if any reading counts.

@@ -260,7 +260,8 @@ impl<'c> Screening<'c> {
     fn take(&mut self, frame: usize) {
         let setting = self.screener.settings.repeatable[frame];
         let reports = |b: usize| !self.screener.readings[(frame, b)].is_nan();
-        let expected: Vec<bool> = (0..self.monitors.len()).map(|b| reports(b) && self.is_expected(frame, b)).collect();
+        let expected: Vec<bool> =
+            (0..self.monitors.len()).map(|b| reports(b) && self.is_expected_within(frame, b, 0.0)).collect();
         let is_lone = self.is_expected_but_for_a_few(frame, &expected);
         let mut rejected = Vec::new();
         for (b, expected) in expected.into_iter().enumerate() {
@@ -382,12 +383,7 @@ impl<'c> Screening<'c> {
         (0..self.monitors.len()).filter(reports).filter(|b| self.monitors[*b].state() != MonitorState::Dead)
     }
 
-    /// True if the model, with all its uncertainty, expects a reading.
-    fn is_expected(&self, frame: usize, b: usize) -> bool {
-        self.is_expected_within(frame, b, 0.0)
-    }
-
-    /// The same, where a reading has a further variance [m^2].
+    /// True if the model, with all its uncertainty, expects a reading that has a further variance [m^2].
     fn is_expected_within(&self, frame: usize, b: usize, further: f64) -> bool {
         let slope = self.model.slope[b].column(self.screener.groups.of_frame[frame]);
         let channel = self.screener.channel(frame, b);

@@ -4,12 +4,14 @@
 //! for each instrument and supply of the ring.
 
 use core::fmt;
+use core::marker::PhantomData;
 use core::ops::Range;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use serde::de::{Error as _, MapAccess, SeqAccess, Unexpected, Visitor};
+use serde::de::value::{MapAccessDeserializer, SeqAccessDeserializer};
+use serde::de::{self, DeserializeOwned, Error as _, IntoDeserializer, MapAccess, SeqAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 use twin::limits::SETTINGS;
 use twin::{Currents, Effect, EffectError, EffectKind, Holding, MagnetLaw, Rf, Ring};
@@ -110,7 +112,7 @@ pub(super) struct HeaderFile<N, T, P> {
 }
 
 type First = HeaderFile<TwoSupplies, Transfer, Positive>;
-type Second = HeaderFile<BTreeMap<String, Positive>, Transfers, PerName>;
+type Second = HeaderFile<BTreeMap<String, Positive>, PerName<Transfer>, PerName<Positive>>;
 
 /// Nominal currents of format 1.
 #[derive(Deserialize)]
@@ -129,16 +131,18 @@ struct Positive(f64);
 #[derive(Clone, Serialize)]
 struct Transfer(Vec<f64>);
 
-/// One transfer function for all supplies, or one for each.
-enum Transfers {
-    All(Transfer),
-    Each(BTreeMap<String, Transfer>),
+/// One value for all, or values by name: of supplies, or of instruments with a default.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum PerName<V> {
+    All(V),
+    Each(BTreeMap<String, V>),
 }
 
-/// One number for all instruments, or some by name and a default.
-enum PerName {
-    All(Positive),
-    Each(BTreeMap<String, Positive>),
+/// A value that is stated so.
+trait Stated: DeserializeOwned {
+    /// What is expected, in words.
+    const EITHER: &str;
 }
 
 /// The key of the number that holds for all instruments that are not named.
@@ -151,12 +155,12 @@ impl Header {
     /// [`RecordingError`], the first fault met.
     pub fn read(file: &Path, ring: &Ring) -> Result<Self, RecordingError> {
         let text = super::text(file, SETTINGS)?;
-        let ring = super::powered(ring, format(file, &text)?);
-        Self::parse(file, &text, &ring, &Names::from_ring(&ring))
+        let text = Text { file, text: &text };
+        let ring = super::powered(ring, text.format()?);
+        Self::parse(&text, &ring, &Names::from_ring(&ring))
     }
 
-    pub(super) fn parse(file: &Path, text: &str, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
-        let text = Text { file, text };
+    pub(super) fn parse(text: &Text, ring: &Ring, names: &Names) -> Result<Self, RecordingError> {
         text.check_names(ring)?;
         let mut header = match text.format()? {
             Format::One => text.first(ring)?,
@@ -241,8 +245,8 @@ impl Header {
                 dipole.into_iter().chain(supplies).map(|(name, nominal)| (name, Positive(nominal))).collect(),
             ),
             quad_transfer: Some(match self.transfer.first() {
-                Some(first) if alike => Transfers::All(Transfer(first.clone())),
-                _ => Transfers::Each(names.supplies.iter().zip(&self.transfer).map(transfer).collect()),
+                Some(first) if alike => PerName::All(Transfer(first.clone())),
+                _ => PerName::Each(names.supplies.iter().zip(&self.transfer).map(transfer).collect()),
             }),
             radial_loop_monitors: self.radial_loop_monitors.clone(),
             note: self.note.clone(),
@@ -251,33 +255,15 @@ impl Header {
     }
 }
 
-/// How a recording is written, by its header.
-pub(super) fn format(file: &Path, text: &str) -> Result<Format, RecordingError> {
-    Text { file, text }.format()
-}
-
-/// The lattice that a header names.
-pub(super) fn lattice(text: &str) -> Option<String> {
-    #[derive(Deserialize)]
-    struct Probe {
-        lattice: String,
-    }
-    toml::from_str(text).ok().map(|Probe { lattice }| lattice)
-}
-
-/// What is wrong with the value of a key.
-pub(super) fn refuse(file: &Path, text: &str, key: &str, what: &str) -> RecordingError {
-    Text { file, text }.refuse_key(key, what)
-}
-
 /// A header as text, and where it comes from.
-struct Text<'a> {
-    file: &'a Path,
-    text: &'a str,
+pub(super) struct Text<'a> {
+    pub file: &'a Path,
+    pub text: &'a str,
 }
 
 impl Text<'_> {
-    fn format(&self) -> Result<Format, RecordingError> {
+    /// How the recording is written.
+    pub fn format(&self) -> Result<Format, RecordingError> {
         #[derive(Deserialize)]
         struct Probe {
             format: Option<toml::Spanned<toml::Value>>,
@@ -328,8 +314,8 @@ impl Text<'_> {
         let nominal: Vec<f64> =
             self.by_supply("nominal_A", &names.supplies, nominal)?.into_iter().map(|Positive(a)| a).collect();
         let transfer = match self.needed("quad_transfer", file.quad_transfer.or_else(|| Some(transfer_by(law?))))? {
-            Transfers::All(transfer) => vec![transfer; names.supplies.len()],
-            Transfers::Each(each) => self.by_supply("quad_transfer", &names.supplies, each)?,
+            PerName::All(transfer) => vec![transfer; names.supplies.len()],
+            PerName::Each(each) => self.by_supply("quad_transfer", &names.supplies, each)?,
         };
         let kick = file.kick_per_ampere.or_else(|| Some(PerName::All(Positive(in_milli(law?.kick_per_ampere())))));
         let kick = self.needed("kick_mrad_per_A", kick)?;
@@ -382,7 +368,7 @@ impl Text<'_> {
     fn by_name(
         &self,
         key: &str,
-        per_name: PerName,
+        per_name: PerName<Positive>,
         instruments: usize,
         index: impl Fn(&str) -> Option<usize>,
     ) -> Result<Vec<f64>, RecordingError> {
@@ -403,24 +389,13 @@ impl Text<'_> {
 
     /// Machine and lattice have to be the ring's, whatever else may be wrong: the header of another one lacks this one's supplies.
     fn check_names(&self, ring: &Ring) -> Result<(), RecordingError> {
-        #[derive(Deserialize)]
-        struct Probe {
-            machine: Option<toml::Value>,
-            lattice: Option<toml::Value>,
+        let machine = word(self.text, "machine").filter(|name| !begins(&ring.name, name));
+        let lattice = word(self.text, "lattice").filter(|file| *file != ring.file);
+        let other = machine.map(|name| ("machine", &ring.name, name));
+        match other.or_else(|| lattice.map(|file| ("lattice", &ring.file, file))) {
+            Some((key, expected, found)) => self.other_machine(key, format!("{expected:?}"), format!("{found:?}")),
+            None => Ok(()),
         }
-        // what is wrong elsewhere is found by the strict reading
-        let Ok(Probe { machine, lattice }) = toml::from_str(self.text) else { return Ok(()) };
-        if let Some(toml::Value::String(name)) = machine
-            && !begins(&ring.name, &name)
-        {
-            return self.other_machine("machine", format!("{:?}", ring.name), format!("{name:?}"));
-        }
-        if let Some(toml::Value::String(file)) = lattice
-            && file != ring.file
-        {
-            return self.other_machine("lattice", format!("{:?}", ring.file), format!("{file:?}"));
-        }
-        Ok(())
     }
 
     /// Particle and energy have to be the ring's.
@@ -494,7 +469,8 @@ impl Text<'_> {
         RecordingError::Header(header_place(self.file, self.text, span), message)
     }
 
-    fn refuse_key(&self, key: &str, message: &str) -> RecordingError {
+    /// What is wrong with the value of a key.
+    pub fn refuse_key(&self, key: &str, message: &str) -> RecordingError {
         RecordingError::Header(self.key(key), message.to_owned())
     }
 
@@ -529,9 +505,21 @@ pub fn at_energy(ring: &Ring, kinetic_energy: f64) -> Cow<'_, Ring> {
 
 /// Kinetic energy that a header states [GeV]; none where it cannot be read, which the strict reading refuses.
 pub(super) fn kinetic_energy(text: &str) -> Option<f64> {
-    let table: toml::Table = text.parse().ok()?;
-    let energy = table.get("kinetic_energy_GeV")?.as_float()?;
+    let energy = value(text, "kinetic_energy_GeV")?.as_float()?;
     (energy.is_finite() && energy > 0.0).then_some(energy)
+}
+
+/// The lattice that a header names; none likewise.
+pub(super) fn lattice(text: &str) -> Option<String> {
+    word(text, "lattice")
+}
+
+fn word(text: &str, key: &str) -> Option<String> {
+    Some(value(text, key)?.as_str()?.to_owned())
+}
+
+fn value(text: &str, key: &str) -> Option<toml::Value> {
+    text.parse::<toml::Table>().ok()?.remove(key)
 }
 
 /// Relative difference of energies that counts as rounding.
@@ -554,11 +542,11 @@ fn nominal_by(law: &Currents) -> BTreeMap<String, Positive> {
 }
 
 /// Transfer functions by the supply law.
-fn transfer_by(law: &Currents) -> Transfers {
+fn transfer_by(law: &Currents) -> PerName<Transfer> {
     let over = |(name, magnets): (&String, &MagnetLaw)| {
         Some((name.clone(), Transfer(magnets.integrated.over(law.supply(name)?))))
     };
-    Transfers::Each(law.quadrupoles.iter().filter_map(over).collect())
+    PerName::Each(law.quadrupoles.iter().filter_map(over).collect())
 }
 
 /// True if a name's words, letter case aside, are the first of the other's: `ags-booster` of `AGS Booster (BNL)`.
@@ -588,102 +576,62 @@ fn last_word(text: &str) -> Option<&str> {
 
 impl<'de> Deserialize<'de> for Positive {
     fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
-        Self::checked(f64::deserialize(value)?)
-    }
-}
-
-impl Positive {
-    fn checked<E: serde::de::Error>(value: f64) -> Result<Self, E> {
-        let refuse = || E::invalid_value(Unexpected::Float(value), &POSITIVE.words);
+        let value = f64::deserialize(value)?;
+        let refuse = || D::Error::invalid_value(Unexpected::Float(value), &POSITIVE.words);
         POSITIVE.check(value).map(Self).ok_or_else(refuse)
     }
 }
 
 impl<'de> Deserialize<'de> for Transfer {
     fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
-        Self::checked(Vec::<f64>::deserialize(value)?)
-    }
-}
-
-impl Transfer {
-    fn checked<E: serde::de::Error>(coefficients: Vec<f64>) -> Result<Self, E> {
+        let coefficients = Vec::<f64>::deserialize(value)?;
         let nominal = 0.0 + coefficients.iter().sum::<f64>(); // p(1); an empty list sums to -0, which would puzzle a reader
         if nominal == 0.0 || !nominal.is_finite() {
             let words = &"finite coefficients with a sum p(1) that is not 0";
-            return Err(E::invalid_value(Unexpected::Other(&format!("p(1) = {nominal}")), words));
+            return Err(D::Error::invalid_value(Unexpected::Other(&format!("p(1) = {nominal}")), words));
         }
         Ok(Self(coefficients))
     }
 }
 
-impl Serialize for Transfers {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        match self {
-            Self::All(transfer) => transfer.serialize(serializer),
-            Self::Each(each) => each.serialize(serializer),
-        }
-    }
+impl Stated for Positive {
+    const EITHER: &str = "a number, or a table of numbers by name";
+}
+
+impl Stated for Transfer {
+    const EITHER: &str = "a list of coefficients, or a table of lists by supply";
 }
 
 /// Serde's untagged enums would say neither what was expected nor where.
-impl<'de> Deserialize<'de> for Transfers {
+impl<'de, V: Stated> Deserialize<'de> for PerName<V> {
     fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
-        struct Either;
-        impl<'de> Visitor<'de> for Either {
-            type Value = Transfers;
-
-            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str("a list of coefficients, or a table of lists by supply")
-            }
-
-            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Transfers, A::Error> {
-                let mut coefficients = Vec::new();
-                while let Some(coefficient) = list.next_element()? {
-                    coefficients.push(coefficient);
-                }
-                Transfer::checked(coefficients).map(Transfers::All)
-            }
-
-            fn visit_map<A: MapAccess<'de>>(self, table: A) -> Result<Transfers, A::Error> {
-                BTreeMap::deserialize(serde::de::value::MapAccessDeserializer::new(table)).map(Transfers::Each)
-            }
-        }
-        value.deserialize_any(Either)
+        value.deserialize_any(Either(PhantomData))
     }
 }
 
-impl Serialize for PerName {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        match self {
-            Self::All(value) => value.serialize(serializer),
-            Self::Each(each) => each.serialize(serializer),
-        }
+struct Either<V>(PhantomData<V>);
+
+impl<'de, V: Stated> Visitor<'de> for Either<V> {
+    type Value = PerName<V>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(V::EITHER)
     }
-}
 
-impl<'de> Deserialize<'de> for PerName {
-    fn deserialize<D: Deserializer<'de>>(value: D) -> Result<Self, D::Error> {
-        struct Either;
-        impl<'de> Visitor<'de> for Either {
-            type Value = PerName;
+    fn visit_f64<E: de::Error>(self, value: f64) -> Result<PerName<V>, E> {
+        V::deserialize(value.into_deserializer()).map(PerName::All)
+    }
 
-            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str("a number, or a table of numbers by name")
-            }
+    fn visit_i64<E: de::Error>(self, value: i64) -> Result<PerName<V>, E> {
+        self.visit_f64(value as f64)
+    }
 
-            fn visit_f64<E: serde::de::Error>(self, value: f64) -> Result<PerName, E> {
-                Positive::checked(value).map(PerName::All)
-            }
+    fn visit_seq<A: SeqAccess<'de>>(self, list: A) -> Result<PerName<V>, A::Error> {
+        V::deserialize(SeqAccessDeserializer::new(list)).map(PerName::All)
+    }
 
-            fn visit_i64<E: serde::de::Error>(self, value: i64) -> Result<PerName, E> {
-                self.visit_f64(value as f64)
-            }
-
-            fn visit_map<A: MapAccess<'de>>(self, table: A) -> Result<PerName, A::Error> {
-                BTreeMap::deserialize(serde::de::value::MapAccessDeserializer::new(table)).map(PerName::Each)
-            }
-        }
-        value.deserialize_any(Either)
+    fn visit_map<A: MapAccess<'de>>(self, table: A) -> Result<PerName<V>, A::Error> {
+        BTreeMap::deserialize(MapAccessDeserializer::new(table)).map(PerName::Each)
     }
 }
 

@@ -24,6 +24,7 @@ pub use drive::Drive;
 pub(crate) use drive::{field, mean, mean_supplies};
 pub use error::{Mismatch, Part, Place, RecordingError};
 pub use frames::Row;
+use header::Text;
 pub use header::{BelievedRf, Format, Header, at_energy};
 pub use names::Names;
 pub use ramp::{At, Ramp};
@@ -81,12 +82,13 @@ impl Recording {
         frames: impl FnOnce() -> Result<String, RecordingError>,
     ) -> Result<Self, RecordingError> {
         let (file, frames_file) = (folder.join(HEADER), folder.join(FRAMES));
-        let ring = powered(ring, header::format(&file, header_text)?);
+        let header_text = Text { file: &file, text: header_text };
+        let ring = powered(ring, header_text.format()?);
         let names = Names::from_ring(&ring);
-        let header = Header::parse(&file, header_text, &ring, &names)?;
+        let header = Header::parse(&header_text, &ring, &names)?;
         let (rows, other) = frames::parse(&frames_file, &frames()?, &header, &ring, &names)?;
-        let refuse = |(key, what): (&str, String)| header::refuse(&file, header_text, key, &what);
-        plausibility::check(&header, &rows, &names.supplies).map_err(refuse)?;
+        plausibility::check(&header, &rows, &names.supplies)
+            .map_err(|(key, what)| header_text.refuse_key(key, &what))?;
         Ok(Self { name: name(folder), header, other, rows })
     }
 
@@ -128,11 +130,6 @@ impl Recording {
     /// Mean `ln` of each supply's factor over all frames [F]: the currents at which the tunes were measured.
     pub fn mean_supplies(&self) -> Vec<f64> {
         mean_supplies(&self.drives())
-    }
-
-    /// A current that the model has no use for, by its column [A].
-    pub fn other(&self, row: &Row, column: &str) -> Option<f64> {
-        self.other.iter().position(|name| name == column).map(|at| row.other[at])
     }
 
     /// Largest kick that a corrector was set to, by read-back where settings are not recorded [rad]; 1 where none was.

@@ -2,6 +2,8 @@
 
 use std::collections::HashMap;
 
+use twin::median;
+
 use super::drive;
 use super::frames::Row;
 use super::header::Header;
@@ -108,7 +110,6 @@ fn repeats(header: &Header, rows: &[Row]) -> Vec<[usize; 2]> {
 /// Robust noise of a monitor [m]; none of one that has few repeats. Equal readings are those of a stuck one.
 fn noise_of(rows: &[Row], repeats: &[[usize; 2]], b: usize) -> Option<f64> {
     let difference = |[before, here]: &[usize; 2]| Some((rows[*here].reading[b]? - rows[*before].reading[b]?).abs());
-    let mut sizes: Vec<f64> = repeats.iter().filter_map(difference).filter(|size| *size > 0.0).collect();
-    sizes.sort_by(f64::total_cmp);
-    (sizes.len() >= ENOUGH).then(|| sizes[sizes.len() / 2] / MEDIAN)
+    let sizes: Vec<f64> = repeats.iter().filter_map(difference).filter(|size| *size > 0.0).collect();
+    (sizes.len() >= ENOUGH).then(|| median(sizes)).flatten().map(|size| size / MEDIAN)
 }

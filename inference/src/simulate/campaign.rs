@@ -179,15 +179,13 @@ fn normal(random: &mut StdRng) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
     use super::*;
+    use crate::testing::recorded;
 
     /// A campaign of the repository, on the ring as designed.
     fn template() -> (Ring, Recording) {
         let ring = Ring::paper_booster();
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/former/paper-vars");
-        let recording = Recording::read(&folder, &ring).unwrap();
+        let recording = recorded(&ring, "former/paper-vars");
         (ring, recording)
     }
 
@@ -220,11 +218,7 @@ mod tests {
             let reading: Vec<f64> = made.rows[0].reading.iter().map(|r| r.unwrap()).collect();
             sizes.push([rms(&reading[..split]), rms(&reading[split..])]);
         }
-        let median = |plane: usize| {
-            let mut of: Vec<f64> = sizes.iter().map(|s| s[plane]).collect();
-            of.sort_by(f64::total_cmp);
-            of[of.len() / 2]
-        };
+        let median = |plane: usize| twin::median(sizes.iter().map(|s| s[plane])).unwrap();
         println!("median rms {:.2e} {:.2e}", median(0), median(1));
         // six shipped recordings: 1.0 to 3.9 mm, median 2.7, in x; 0.8 to 2.1 mm, median 1.4, in y
         assert!((2e-3..3.5e-3).contains(&median(0)), "x {:e}", median(0));
@@ -280,10 +274,10 @@ mod tests {
         let quiet = campaign(&recording, &ring, &truth, &quiet, 3).unwrap();
         let off = readings(&noisy) - readings(&quiet);
         for (b, name) in ring.monitor_names().iter().enumerate() {
-            let mut sizes: Vec<f64> = off.column(b).iter().filter(|v| v.is_finite()).map(|v| v.abs()).collect();
-            sizes.sort_by(f64::total_cmp);
-            let sigma = sizes[sizes.len() / 2] / 0.6745 / recording.header.noise[0];
-            let far = sizes.iter().filter(|v| **v > 1e-3).count();
+            let column = off.column(b);
+            let sizes = column.iter().filter(|v| v.is_finite()).map(|v| v.abs());
+            let sigma = twin::median(sizes.clone()).unwrap() / 0.6745 / recording.header.noise[0];
+            let far = sizes.filter(|v| *v > 1e-3).count();
             let (stated, jumps) = if name == "x_C6" { (4.3, true) } else { (1.0, name == "y_B5") };
             // the median of 346 absolute values scatters by 6 %
             assert!((sigma / stated - 1.0).abs() < 0.25, "{name}: {sigma}");

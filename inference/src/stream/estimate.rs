@@ -1,6 +1,7 @@
 //! The estimate of a core after a frame, for a ring of any size.
 
-use estimator::{Health, Layout, Marginal, Mask, MonitorState, Prior, Remarks};
+use estimator::wire::link::Answer;
+use estimator::{Health, Layout, Mask, MonitorState, Remarks};
 use training::rooms::largest;
 
 /// The vars and the state of the monitors after a frame: [`estimator::Estimate`] without spare slots.
@@ -33,48 +34,16 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Marginal posterior of param `i`; none beyond the last.
-    pub fn marginal(&self, i: usize, prior: &Prior) -> Option<Marginal> {
-        let Prior { lower, upper, .. } = *prior;
-        Some(Marginal { mean: *self.centre.get(i)?, sigma: *self.params_sigma.get(i)?, lower, upper })
-    }
-
-    /// Readings that were used, tunes included.
-    pub fn readings(&self) -> usize {
-        self.accepted.iter().filter(|accepted| **accepted).count() + self.tune_innovation.iter().flatten().count()
-    }
-
     /// That of a core which has room for the ring.
+    ///
+    /// # Panics
+    /// Never: every state of a monitor has a code.
     pub fn from_core<const B: usize, const N: usize, const W: usize>(
-        e: &estimator::Estimate<B, N, W>,
+        estimate: &estimator::Estimate<B, N, W>,
         layout: &Layout,
     ) -> Self {
-        let params = |values: &[f32; N]| values[..layout.params()].to_vec();
         let slots = (0..layout.monitors()).map(|b| layout.monitor(b));
-        let monitors = |mask: &Mask<W>| slots.clone().map(|b| mask.has(b)).collect();
-        Self {
-            sequence: e.sequence,
-            time_us: e.time_us,
-            frames: e.frames,
-            rejected_frames: e.rejected_frames,
-            mean: params(&e.mean),
-            sigma: params(&e.sigma),
-            map_params: params(&e.map_params),
-            centre: params(&e.centre),
-            params_sigma: params(&e.params_sigma),
-            clipped: (0..layout.params()).map(|i| e.clipped.has(i)).collect(),
-            nis: e.nis,
-            accepted: monitors(&e.accepted),
-            rejected: monitors(&e.rejected),
-            confirmed: monitors(&e.confirmed),
-            restarted: monitors(&e.restarted),
-            tune_innovation: e.tune_innovation,
-            setting: e.setting,
-            log_evidence: e.log_evidence,
-            linearised: e.linearised,
-            remarks: e.remarks,
-            health: slots.clone().map(|b| e.health[b]).collect(),
-        }
+        Self::picked(&estimate.into(), layout.params(), slots).expect("every state of a monitor has a code")
     }
 
     /// That of a device of any size, if every list of its reply is complete.
@@ -85,14 +54,23 @@ impl Estimate {
         let is_whole = lists.iter().all(|list| list.len() == params)
             && masks.iter().all(|mask| mask.len() == estimator::words(monitors))
             && answer.clipped.len() == estimator::words(params);
-        if !is_whole {
-            return None;
-        }
-        let bits = |words: &[u32], count| {
-            let mask = Mask::<{ largest::WORDS }>::from_words(words);
-            (0..count).map(|i| mask.has(i)).collect::<Vec<bool>>()
+        is_whole.then(|| Self::picked(answer, params, 0..monitors)).flatten()
+    }
+
+    /// The first params and the monitors of some slots; none if a state of a monitor is unknown.
+    fn picked<const B: usize, const N: usize, const W: usize>(
+        answer: &Answer<B, N, W>,
+        params: usize,
+        slots: impl Iterator<Item = usize> + Clone,
+    ) -> Option<Self> {
+        let first = |values: &[f32]| values[..params].to_vec();
+        let monitors = |words: &[u32]| {
+            let mask = Mask::<W>::from_words(words);
+            slots.clone().map(|b| mask.has(b)).collect()
         };
-        let health = |&(state, noise, weighted_as, rejected): &(u8, f32, f32, u32)| {
+        let clipped = Mask::<W>::from_words(&answer.clipped);
+        let health = |b: usize| {
+            let (state, noise, weighted_as, rejected) = answer.health[b];
             Some(Health { state: MonitorState::from_code(state)?, noise, weighted_as, rejected })
         };
         Some(Self {
@@ -100,23 +78,23 @@ impl Estimate {
             time_us: answer.time_us,
             frames: answer.frames,
             rejected_frames: answer.rejected_frames,
-            mean: answer.mean.to_vec(),
-            sigma: answer.sigma.to_vec(),
-            map_params: answer.map_params.to_vec(),
-            centre: answer.centre.to_vec(),
-            params_sigma: answer.params_sigma.to_vec(),
-            clipped: bits(&answer.clipped, params),
+            mean: first(&answer.mean),
+            sigma: first(&answer.sigma),
+            map_params: first(&answer.map_params),
+            centre: first(&answer.centre),
+            params_sigma: first(&answer.params_sigma),
+            clipped: (0..params).map(|i| clipped.has(i)).collect(),
             nis: answer.nis,
-            accepted: bits(&answer.accepted, monitors),
-            rejected: bits(&answer.rejected, monitors),
-            confirmed: bits(&answer.confirmed, monitors),
-            restarted: bits(&answer.restarted, monitors),
+            accepted: monitors(&answer.accepted),
+            rejected: monitors(&answer.rejected),
+            confirmed: monitors(&answer.confirmed),
+            restarted: monitors(&answer.restarted),
             tune_innovation: answer.tune_innovation,
             setting: answer.setting,
             log_evidence: answer.log_evidence,
             linearised: answer.linearised,
             remarks: answer.remarks,
-            health: answer.health.iter().map(health).collect::<Option<_>>()?,
+            health: slots.clone().map(health).collect::<Option<_>>()?,
         })
     }
 }

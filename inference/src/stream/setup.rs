@@ -2,7 +2,7 @@
 
 use estimator::{Calibration, Each, GROUPS, Gate, Layout, Prior, Ramp, RampPoint, SupplyCalibration, Walk};
 use training::rooms::largest;
-use twin::Ring;
+use twin::{Ring, median};
 
 use super::StreamError;
 use crate::campaign::TUNE_CALIBRATION;
@@ -41,10 +41,8 @@ pub struct Setup {
 /// A random walk of the params, and of the baselines [m], by so much per square root of a cycle of a recording, lost ones counted.
 pub fn walk_per_cycle(recording: &Recording, params: f32, baselines: f32) -> Walk {
     let cycles = |rows: &[Row]| f64::from(rows[1].sequence - rows[0].sequence);
-    let mut periods: Vec<f64> =
-        recording.rows.windows(2).map(|rows| (rows[1].time - rows[0].time) / cycles(rows)).collect();
-    periods.sort_by(f64::total_cmp);
-    let period = periods.get(periods.len() / 2).copied().unwrap_or(1.0);
+    let periods = recording.rows.windows(2).map(|rows| (rows[1].time - rows[0].time) / cycles(rows));
+    let period = median(periods).unwrap_or(1.0);
     let per_second = 1.0 / period.sqrt() as f32;
     Walk { params: params * per_second, baselines: baselines * per_second }
 }

@@ -6,7 +6,7 @@ use indicatif::ProgressBar;
 use inference::Recording;
 use inference::nuts::NutsSettings;
 use measured::Folder;
-use results::{Design, FitResult, fit_by_draws, fit_by_steps, fit_page, output};
+use results::{Design, FitResult, fit_by_draws, fit_by_steps, fit_page, output, save_draws};
 use twin::Ring;
 
 use super::{CommandError, check_outputs, deliver, machine_with, matrix, progress, recording};
@@ -79,7 +79,7 @@ fn with_bar(options: &Fit, ring: &Ring, recording: &Recording) -> Result<FitResu
     bar.finish_and_clear();
     let (result, draws) = sampled?;
     if let Some(folder) = &options.save_draws {
-        draws.write(folder).map_err(|e| CommandError::Other(e.to_string()))?;
+        save_draws(&draws, folder)?;
     }
     Ok(result)
 }

@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 
 use diagnosis::{Finding, Shown, capitalised};
 use report::{Axes, Figure, Series};
+use twin::median;
 
 use super::partial::Partial;
 use super::signed;
@@ -244,9 +245,7 @@ fn of_settings(partial: &Partial, per: f64) -> Vec<Point> {
 
 /// Those that are not much noisier than most.
 fn sharp(mut points: Vec<Point>) -> Vec<Point> {
-    let mut sigmas: Vec<f64> = points.iter().map(|point| point.sigma()).collect();
-    sigmas.sort_by(f64::total_cmp);
-    let median = sigmas.get(sigmas.len() / 2).copied().unwrap_or(f64::INFINITY);
+    let median = median(points.iter().map(|point| point.sigma())).unwrap_or(f64::INFINITY);
     points.retain(|point| point.sigma() <= NOISY * median);
     points
 }
