@@ -117,9 +117,6 @@ impl Fitted {
     }
 
     /// The hypothesis at the prior's mean, linearised and not fitted.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub(crate) fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
         let u = DVector::zeros(data.units.len() + hypothesis.unknowns(data).len());
         let problem = Problem::new(data, hypothesis, &u)?;
@@ -191,7 +188,7 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`] if there is no stable machine.
-    pub(crate) fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
+    pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
         let problem = Problem::new(self.data(data), &self.hypothesis, u)?;
         let residual = problem.residual(u)?;
         let slope = problem.ordinary.beside(problem.jacobian(u)?).tr_mul(&residual) - u;
@@ -285,9 +282,6 @@ impl Fitted {
     }
 
     /// That in each recording.
-    ///
-    /// # Errors
-    /// [`EffectError`].
     pub(crate) fn machines_on_orbit(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
         (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
@@ -361,9 +355,6 @@ impl Fitted {
     /// Step of `ln` of the vars, and its covariance, were the same unknowns as wide as those of another hypothesis and some families in the model
     /// besides: to first order. With `D` the ratios of the widths, `X` what the families do per width and `J' = (J D, X)`:
     /// `u' = (1 + J'^T J')^-1 J'^T (r + J u)`.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub(crate) fn widened(
         &self,
         data: &Data,

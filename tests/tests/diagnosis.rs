@@ -3,11 +3,12 @@
 
 use std::collections::BTreeSet;
 
-use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Term, Verdict, candidates, sample, scan};
+use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Term, Verdict, candidates, scan};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
 use inference::{Campaign, Imperfection, Measure, Recording};
 use nalgebra::DVector;
+use system_tests::posterior::sample;
 use system_tests::{recording, repository};
 use twin::{Effect, EffectKind, Machine, Measured, Rf, Ring};
 use validation::{Cases, Class, Grade, Truth, Unmodelled, UnmodelledKind};
