@@ -10,7 +10,7 @@ use super::experiment::Proposal;
 use super::heldout::{self, Score};
 use super::hypothesis::in_order;
 use super::out_of_range::OutOfRange;
-use super::readback::Contradiction;
+use super::readback::contradictions;
 use super::scan;
 use super::search::{Found, Search};
 use super::term::Term;
@@ -25,8 +25,6 @@ use inference::Imperfection;
 pub struct Diagnosis {
     /// All that was found, with its fits.
     pub found: Found,
-    /// Read-backs of correctors that contradict their settings.
-    pub contradictions: Vec<Contradiction>,
     /// What passes within settings, which is not in the data of `found`.
     pub transients: Vec<Transient>,
     /// The verdict.
@@ -77,9 +75,6 @@ impl Diagnosis {
                 return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
             }
         }
-        let names = ring.corrector_names();
-        let of_each = recordings.iter().flat_map(|recording| Contradiction::all(recording, &names));
-        let contradictions: Vec<Contradiction> = of_each.collect();
         progress("what passes within settings");
         let (mut transients, mut joined) = (Vec::new(), Vec::new());
         for (index, recording) in recordings.iter().enumerate() {
@@ -118,10 +113,15 @@ impl Diagnosis {
         let (vars_before, vars_after) = (Vars::from_fit(&found.null), Vars::averaged(&found).widened(&found)?);
         // a poor fit says nothing of single vars
         let beyond = if found.best.is_poor() { Vec::new() } else { OutOfRange::all(&data.ring, &vars_after) };
-        let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions, &beyond);
+        let names = ring.corrector_names();
+        let contradicted = |recording: &&Recording| {
+            let said = contradictions(recording, &names).into_iter();
+            said.map(|said| verdict::in_recording(data, &recording.name, said)).collect::<Vec<_>>()
+        };
+        let contradicted = recordings.iter().flat_map(contradicted).collect();
+        let sentence = verdict::sentence(data, &found, verdict, &findings, contradicted, &beyond);
         Ok(Self {
             found,
-            contradictions,
             transients,
             verdict,
             sentence,

@@ -88,7 +88,6 @@ pub use location::Location;
 pub use odds::{DECISIVE, ODDS, SUSPICIOUS, UNMODELLED, corrections};
 pub use out_of_range::OutOfRange;
 pub use place_scan::{Interval, PlaceScan};
-pub use readback::Contradiction;
 pub use scale::QUOTED;
 pub use scan::{Candidate, candidates, scan};
 pub use search::{Found, correction_of};

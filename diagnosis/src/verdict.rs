@@ -15,15 +15,14 @@ use super::fit::Fitted;
 use super::heldout::{Block, Score, gain_of_choice, lessened, rival};
 use super::limits::Limits;
 use super::location::Location;
-use super::lost_frames::LostFrames;
+use super::lost_frames::lost_frames;
 use super::odds::corrections;
 use super::odds::{DECISIVE, SUSPICIOUS};
 use super::out_of_range::OutOfRange;
 use super::place_scan::{Interval, PlaceScan};
-use super::readback::Contradiction;
 use super::scan::separations;
 use super::search::Found;
-use super::stuck_monitor::Stuck;
+use super::stuck_monitor::stuck_monitors;
 use super::term::Term;
 use super::tested::Tested;
 use super::transients::Transient;
@@ -294,9 +293,6 @@ impl Finding {
 }
 
 /// Tests of each effect: all effects against all but this one, and the candidates against that.
-///
-/// # Errors
-/// [`FitError`].
 pub fn tests(
     data: &Data,
     found: &Found,
@@ -333,9 +329,6 @@ pub fn tests(
 }
 
 /// Test of the unknown element in the model, all effects against all but this; none where there is no such element.
-///
-/// # Errors
-/// [`FitError`].
 pub fn test_of_element(
     data: &Data,
     found: &Found,
@@ -353,9 +346,6 @@ pub fn test_of_element(
 
 /// One finding for each effect, strongest first, then the most likely cause that is not in the model; `of_means`: the verdict on the means of
 /// settings.
-///
-/// # Errors
-/// [`FitError`].
 pub fn findings(
     data: &Data,
     found: &Found,
@@ -430,7 +420,7 @@ pub fn sentence(
     found: &Found,
     verdict: Verdict,
     findings: &[Finding],
-    contradictions: &[Contradiction],
+    contradictions: Vec<String>,
     beyond: &[OutOfRange],
 ) -> String {
     let phrases =
@@ -448,8 +438,7 @@ pub fn sentence(
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => unexplained(found, findings),
     };
-    let contradicted = contradictions.iter().map(|one| in_recording(data, &one.recording, one.to_string()));
-    let mut said: Vec<String> = contradicted.chain(beyond.iter().map(OutOfRange::to_string)).collect();
+    let mut said: Vec<String> = contradictions.into_iter().chain(beyond.iter().map(OutOfRange::to_string)).collect();
     let rows = widths::rows(data, &found.best).into_iter();
     let (common, scatters): (Vec<Imperfection>, Vec<Imperfection>) = rows.partition(|row| row.measure == Measure::Mean);
     let off = Imperfection::told(&common).map(|told| format!("{THROUGHOUT}: {told}"));
@@ -466,7 +455,7 @@ pub fn sentence(
 }
 
 /// What is said of one of several recordings.
-fn in_recording(data: &Data, recording: &str, said: String) -> String {
+pub(super) fn in_recording(data: &Data, recording: &str, said: String) -> String {
     if data.is_joint() { format!("in {recording} {said}") } else { said }
 }
 
@@ -478,8 +467,10 @@ fn remarks(data: &Data) -> Vec<String> {
         remarks.extend(own.noise.remarks().into_iter().map(|said| in_recording(data, &own.name, said)));
         remarks.extend(wandering(own).into_iter().map(|said| in_recording(data, &own.name, said)));
     }
-    remarks.extend(Stuck::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
-    remarks.extend(LostFrames::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
+    for own in data.campaigns() {
+        remarks.extend(stuck_monitors(own).into_iter().map(|said| in_recording(data, &own.name, said)));
+    }
+    remarks.extend(data.campaigns().filter_map(|own| Some(in_recording(data, &own.name, lost_frames(own)?))));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)
@@ -603,9 +594,6 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
 }
 
 /// The measurement that would best separate the two most likely causes, for an ambiguous verdict.
-///
-/// # Errors
-/// [`FitError`].
 pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<String>, FitError> {
     let Some((menu, [one, against])) = menu(data, found, verdict)? else { return Ok(None) };
     Ok(menu.proposals.first().map(|best| {
