@@ -48,9 +48,6 @@ impl Vars {
     }
 
     /// The same with room for what the recording cannot show ([`Hypothesis::unseen`], [`Family::hidden`]), to first order.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub(crate) fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
         let (step, wide) = best.widened(data, &best.hypothesis.unseen(data), &Family::hidden(data))?;

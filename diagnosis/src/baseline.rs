@@ -48,9 +48,6 @@ const FLATTEST: f64 = 0.2;
 impl Baseline {
     /// The orbit (x, y) at every element [m] and its properties, from the readings less the response to the kicks (rows frames, columns
     /// monitors) and the recorded tunes. `per_rms`: change per RF offset beyond the design dispersion, per rms of the baselines.
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the ring has no orbit.
     pub fn from_readings(
         ring: &Ring,
         readings: &DMatrix<f64>,
@@ -88,9 +85,6 @@ impl Baseline {
 
     /// Displace a machine's quadrupoles so that its orbit without kicks is the estimated one; what it has by itself, off momentum, is not
     /// theirs.
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the machine has no orbit.
     pub(crate) fn displace(&self, machine: &mut Machine) -> Result<(), OrbitError> {
         let own = machine.orbit()?;
         let ring = machine.ring_mut();

@@ -23,9 +23,6 @@ const SEED: u64 = 1;
 const ROUNDING: f64 = 1e-9;
 
 /// Probability that the best of the candidates is at least as much better than its penalty as in this recording, were none of them there.
-///
-/// # Errors
-/// [`FitError::Degenerate`].
 pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
     let scores = || choice.scores.iter().copied();
     let best =

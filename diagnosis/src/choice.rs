@@ -31,9 +31,6 @@ const BEYOND_CHANCE: f64 = 100.0;
 
 impl<'d> Choice<'d> {
     /// Of some terms and their penalties. Exchanged instruments that neither the recording nor chance can choose are left out.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub fn from_terms(data: &'d Data, without: &'d Fitted, terms: &[Term], penalty: &[f64]) -> Result<Self, FitError> {
         let columns = signatures(data, without, terms)?;
         let projection = Projection::from_fit(without);

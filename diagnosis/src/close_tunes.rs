@@ -28,9 +28,6 @@ const APART: f64 = 3.0;
 
 impl CloseTunes {
     /// Of a machine on its orbit, and tunes as recorded, rows frames; none where they are far enough apart, or not recorded.
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the machine keeps no beam.
     pub fn find(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
         let distances = recorded.row_iter().map(|tunes| tunes[0] - tunes[1]).filter(|distance| distance.is_finite());
         let distances: Vec<f64> = distances.map(|distance| (distance - distance.round()).abs()).collect();

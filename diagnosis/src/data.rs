@@ -612,9 +612,6 @@ impl Data {
     }
 
     /// Several signatures, whitened, one a column; columns of none stay 0. All columns of a channel at once are several times as fast as one by one.
-    ///
-    /// # Errors
-    /// The first among the signatures.
     pub(crate) fn signatures<E>(
         &self,
         mut into: DMatrixViewMut<f64>,

@@ -61,9 +61,6 @@ struct Derivatives {
 
 impl Menu {
     /// For a cause of some amplitude and its rival (another cause, or none), beside a fit.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub fn from_causes(
         data: &Data,
         fitted: &Fitted,

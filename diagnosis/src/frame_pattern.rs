@@ -95,9 +95,6 @@ const OCTAVES: f64 = 7.0;
 
 impl Shape {
     /// All of some optics, at the read monitors.
-    ///
-    /// # Errors
-    /// [`OrbitError`] of unstable motion.
     pub fn all(optics: &Optics, ring: &Ring) -> Result<Vec<Self>, OrbitError> {
         let twiss = optics.twiss()?;
         let observers = optics.read_monitors();

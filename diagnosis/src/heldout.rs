@@ -265,9 +265,6 @@ const FOLDS: usize = 5;
 /// the others is larger by `exp(B - B_kept)` with the term than without; the mixture gains
 ///
 /// `ln(1 + sum of exp(B - penalty)) - ln(1 + sum of exp(B_kept - penalty))`.
-///
-/// # Errors
-/// [`FitError`].
 pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
     let (data, all) = (choice.data, &choice.scores);
     let precision = Precision::from_fit(data, choice.without);
@@ -293,17 +290,11 @@ pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
 }
 
 /// The same fit without its effects and its unknown element, what is ordinary being of the same size.
-///
-/// # Errors
-/// [`FitError`].
 pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
     without_terms(data, fitted, &fitted.hypothesis.terms, &fitted.hypothesis.without_element())
 }
 
 /// The same fit without one of its terms, to compare its predictions with.
-///
-/// # Errors
-/// [`FitError`].
 pub fn rival(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
     without_terms(data, fitted, &fitted.hypothesis.terms[term..=term], &fitted.hypothesis)
 }
@@ -315,9 +306,6 @@ fn without_terms(data: &Data, fitted: &Fitted, terms: &[Term], from: &Hypothesis
 }
 
 /// The same fit without one of its terms.
-///
-/// # Errors
-/// [`FitError`].
 pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
     lessened(data, fitted, fitted.hypothesis.without(term))
 }

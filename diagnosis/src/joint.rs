@@ -128,9 +128,6 @@ impl Data {
     }
 
     /// Whitened numbers of all, recording by recording: `of` is given its index and its data.
-    ///
-    /// # Errors
-    /// Those of `of`.
     pub(crate) fn stacked<E>(&self, of: impl Fn(usize, &Self) -> Result<DVector<f64>, E>) -> Result<DVector<f64>, E> {
         let mut all = DVector::zeros(self.whole_size());
         for ((index, one), rows) in self.campaigns().enumerate().zip(self.parts()) {
@@ -140,9 +137,6 @@ impl Data {
     }
 
     /// The same of several columns; `fill` fills the rows of one recording, which are 0.
-    ///
-    /// # Errors
-    /// Those of `fill`.
     pub(crate) fn stacked_columns<E>(
         &self,
         columns: usize,

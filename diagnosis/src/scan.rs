@@ -80,9 +80,6 @@ impl Projection {
     }
 
     /// About the same point without one of its unknowns: the residuals are those with it at zero.
-    ///
-    /// # Errors
-    /// [`FitError::Degenerate`].
     pub fn without(fitted: &Fitted, unknown: usize) -> Result<Self, FitError> {
         let residual = &fitted.residual + fitted.jacobian.column(unknown) * fitted.u[unknown];
         let back = fitted.jacobian.transpose().remove_row(unknown);
@@ -194,9 +191,6 @@ pub(super) fn of_each(machines: &[(Machine, Drives)]) -> Result<Vec<Signatures<'
 }
 
 /// Whitened signatures of some terms about a fit, one a column, per prior standard deviation.
-///
-/// # Errors
-/// [`FitError`].
 pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatrix<f64>, FitError> {
     let data = fitted.data(data);
     let machines = fitted.machines_on_orbit(data)?;
@@ -260,9 +254,6 @@ impl Rivals {
 }
 
 /// [`Rivals::expected`] of a term of some amplitude (in the unit of its kind) over each of some others, beside a fit.
-///
-/// # Errors
-/// [`FitError`].
 pub fn separations(
     data: &Data,
     fitted: &Fitted,

@@ -87,9 +87,6 @@ impl Search {
     }
 
     /// Search.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub fn run(&self, data: Data) -> Result<Found, FitError> {
         let found = self.grown(self.with_noise(self.without_effects(data)?)?)?;
         // where that fails the search stands as it is

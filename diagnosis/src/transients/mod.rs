@@ -94,9 +94,6 @@ impl Transient {
 
 impl Transients {
     /// Find them, one after the other.
-    ///
-    /// # Errors
-    /// [`OrbitError`].
     pub fn find(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let mut campaign = Campaign::of(ring, recording)?;
         let optics = Optics::of(campaign.held.ring(), Hold::Momentum { delta: 0.0 })?;
