@@ -8,9 +8,8 @@ use nalgebra::{DMatrix, DVector};
 
 use super::alternatives::{Cause, Competition};
 use super::discrepancy::Discrepancy;
-use super::error::FitError;
 use super::family::Family;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 #[cfg(doc)]
 use super::hypothesis::Hypothesis;
 use super::odds::DECISIVE;

@@ -13,7 +13,7 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::StandardNormal;
 
 use super::choice::Choice;
-use super::error::FitError;
+use super::fit::FitError;
 use super::scan::SignatureScore;
 
 /// Recordings drawn: a probability of 1 % is then known to a half.

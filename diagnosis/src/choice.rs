@@ -4,8 +4,7 @@
 use nalgebra::DMatrix;
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::scan::{Projection, Scored, SignatureScore, signatures};
 use super::term::Term;
 

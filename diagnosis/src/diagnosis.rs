@@ -5,8 +5,8 @@ use twin::{Effect, Ring};
 
 use super::average::Vars;
 use super::data::{Data, DataError};
-use super::error::FitError;
 use super::experiment::Proposal;
+use super::fit::FitError;
 use super::heldout::{self, Score};
 use super::hypothesis::in_order;
 use super::out_of_range::OutOfRange;

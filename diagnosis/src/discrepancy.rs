@@ -23,8 +23,7 @@ use twin::{Plane, Signature, Signatures};
 
 use super::data::Data;
 use super::element::{Element, Form, Linear};
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::location::Location;
 pub use gradient::steering;
 use gradient::{Changing, Runs, Where};
@@ -73,7 +72,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted, least: f64) -> Result<V
         return Ok(Vec::new());
     }
     let (machine, drives) = fitted.machine_on_orbit(all, campaign)?;
-    let predicted = fitted.predicted_in(all, campaign)?;
+    let predicted = fitted.predicted(all, campaign)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let mut found = Vec::new();
     for &b in &active {
@@ -297,7 +296,7 @@ mod tests {
         }
         let indicator = data.settings.indicator();
         let sums: Vec<Sums> = (0..data.monitors()).map(|b| data.sums(b, &seen, &indicator)).collect();
-        let (machine, drives) = fitted.machine(&data).unwrap();
+        let (machine, drives) = fitted.machine(&data, 0).unwrap();
         let read = |pattern: &DVector<f64>| {
             DVector::from_fn(pattern.len(), |b, _| if monitors.contains(&b) { pattern[b] } else { 0.0 })
         };

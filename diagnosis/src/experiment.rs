@@ -7,8 +7,7 @@ use nalgebra::{DMatrix, DVector};
 use twin::{Drives, Machine, Quadrupole, Signatures};
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::scan::Rivals;
 use super::term::Term;
 
@@ -69,12 +68,12 @@ impl Menu {
     ) -> Result<Self, FitError> {
         let sigma = &fitted.units.sigma;
         let of_recording = |campaign: usize| {
-            let (machine, drives) = fitted.machine_in(data, campaign)?;
+            let (machine, drives) = fitted.machine(data, campaign)?;
             let weight = data.momentum / data.campaign(campaign).momentum;
             Derivatives::from_machine(data.campaign(campaign), (&machine, &drives), sigma, (one.0, other), weight)
         };
         let present: Vec<Derivatives> = (0..data.count()).map(of_recording).collect::<Result<_, _>>()?;
-        let (machine, drives) = fitted.machine(data)?;
+        let (machine, drives) = fitted.machine(data, 0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
         let free = [Some(one.0), other].map(|term| term.is_some_and(|term| !term.kind.is_switch()));
         let mut proposals = Vec::new();

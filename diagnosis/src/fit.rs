@@ -8,19 +8,16 @@
 //! the data is included, since hypotheses with drifting baselines change their covariance. The ordinary imperfections, many and
 //! small, are taken to first order about the start of the fit (gains no lower than -0.5), but for those that change the focusing.
 
-use core::ops::{Mul, Sub};
-
 use nalgebra::{DMatrix, DVector};
-use twin::{Drives, EffectError, EffectKind, Machine, Measured, Signature, Signatures};
+use twin::{Drives, EffectError, EffectKind, Machine, Measured, OrbitError, Signature, Signatures};
 
 use super::data::Data;
 use super::element::Form;
-use super::error::FitError;
 use super::family::Family;
 use super::hypothesis::Hypothesis;
 use super::term::Term;
 use super::units::{BoundedGaussian, Units};
-use super::unknown::{Member, Unknown};
+use super::unknown::Unknown;
 use evidence::{Factor, gram};
 use inference::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
@@ -50,7 +47,25 @@ pub struct Fitted {
     /// `J^T r - u`, zero for the vars that are held.
     pub slope: DVector<f64>,
     /// The data as this fit has them, where they are its own: whitened for baselines that drift, or linearised about its machine.
-    own: Option<Box<Data>>,
+    pub(super) own: Option<Box<Data>>,
+}
+
+/// Why a hypothesis has no fit.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FitError {
+    /// No stable machine where the fit begins, or an effect that is not defined for this ring.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
+    /// A derivative is so large, or not a number, that the normal matrix is not positive.
+    #[error("the normal matrix of a fit is not positive")]
+    Degenerate,
+}
+
+impl From<OrbitError> for FitError {
+    fn from(error: OrbitError) -> Self {
+        Self::Effect(error.into())
+    }
 }
 
 const LIMITS: Limits = Limits { settled: 0.01, steps: 25, halvings: 6 };
@@ -78,13 +93,6 @@ struct Ordinary {
     slopes: DMatrix<f64>,
     /// `Z^T Z`.
     gram: DMatrix<f64>,
-}
-
-/// A point of the fit.
-struct Point {
-    u: DVector<f64>,
-    residual: DVector<f64>,
-    cost: f64,
 }
 
 impl Fitted {
@@ -123,17 +131,12 @@ impl Fitted {
         let (cost, residual) = problem.evaluate(&u)?;
         let (quadratic, slopes) = problem.linearise(&u, &residual)?;
         let factor = quadratic.factor().ok_or(FitError::Degenerate)?;
-        Self::from_point(&problem, Point { u, residual, cost }, factor, slopes)
+        Self::from_point(&problem, u, residual, cost, factor, slopes)
     }
 
     /// The data as this fit has them.
     pub fn data<'d>(&'d self, data: &'d Data) -> &'d Data {
         self.own.as_deref().unwrap_or(data)
-    }
-
-    /// True if it has data of its own.
-    pub(super) fn has_own(&self) -> bool {
-        self.own.is_some()
     }
 
     /// This fit, which was to some data, and is kept beside others; if it has data of its own, it keeps these.
@@ -153,21 +156,26 @@ impl Fitted {
             OptimiseError::Degenerate => FitError::Degenerate,
         })?;
         let factor = found.quadratic.factor().ok_or(FitError::Degenerate)?;
-        let here = Point { u: found.x, residual: found.point, cost: found.cost };
-        Self::from_point(&problem, here, factor, found.slopes)
+        Self::from_point(&problem, found.x, found.point, found.cost, factor, found.slopes)
     }
 
-    fn from_point(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
+    fn from_point(
+        problem: &Problem,
+        u: DVector<f64>,
+        residual: DVector<f64>,
+        cost: f64,
+        factor: Factor,
+        slopes: DMatrix<f64>,
+    ) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.hypothesis.units(problem.data));
         let jacobian = problem.ordinary.beside(slopes);
-        let params = units.params(&here.u);
-        let slope = jacobian.tr_mul(&here.residual) - &here.u;
-        let within = BoundedGaussian::from_precision(&factor, &here.u, slope, &units);
+        let params = units.params(&u);
+        let slope = jacobian.tr_mul(&residual) - &u;
+        let within = BoundedGaussian::from_precision(&factor, &u, slope, &units);
         let BoundedGaussian { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let log_prior = problem.hypothesis.log_prior();
-        let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + log_prior;
+        let log_evidence = -0.5 * (cost + log_det + data.whole_log_det()) + log_inside + log_prior;
         let hypothesis = problem.hypothesis.clone();
-        let Point { u, residual, cost } = here;
         Ok(Self {
             hypothesis,
             units,
@@ -224,22 +232,21 @@ impl Fitted {
 
     /// Angle by which its unknown element turns the planes [rad], if that is what it does.
     pub(crate) fn turned(&self, data: &Data) -> Option<Measured> {
-        let turns = |(i, unknown): (usize, &Unknown)| match unknown {
-            Unknown::Form(_, Form::Rotation, sigma) => Some((self.params.len() + i, *sigma)),
-            _ => None,
-        };
-        let (at, scale) = self.hypothesis.unknowns(data).iter().enumerate().find_map(turns)?;
+        let (at, scale) = self.find(data, |unknown| matches!(unknown, Unknown::Form(_, Form::Rotation, _)))?;
         let (value, sigma) = self.sized(at, scale);
         Some(Measured { value, sigma })
     }
 
     /// Index of the amplitude of a term among the unknowns, and its prior standard deviation.
     pub fn unknown(&self, data: &Data, term: usize) -> Option<(usize, f64)> {
+        self.find(data, |unknown| matches!(unknown, Unknown::Amplitude(of, _) if *of == term))
+    }
+
+    /// Index of an unknown, the first of a sort, and its prior standard deviation.
+    fn find(&self, data: &Data, is_of_sort: impl Fn(&Unknown) -> bool) -> Option<(usize, f64)> {
         let unknowns = self.hypothesis.unknowns(data);
-        unknowns.iter().enumerate().find_map(|(i, unknown)| match unknown {
-            Unknown::Amplitude(of, scale) if *of == term => Some((self.params.len() + i, *scale)),
-            _ => None,
-        })
+        let at = unknowns.iter().position(is_of_sort)?;
+        Some((self.params.len() + at, unknowns[at].sigma()))
     }
 
     /// The best point as the start of a fit of another hypothesis: unknowns that both have keep their values.
@@ -256,20 +263,12 @@ impl Fitted {
         DVector::from_vec(all.chain(others.iter().map(|unknown| value(unknown).unwrap_or(0.0))).collect())
     }
 
-    /// The machine at the best point, and its drives.
+    /// The machine at the best point in one of the recordings, and its drives.
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn machine(&self, data: &Data) -> Result<(Machine, Drives), EffectError> {
-        self.machine_in(data, 0)
-    }
-
-    /// The same in one of several recordings.
-    ///
-    /// # Errors
-    /// [`EffectError`].
-    pub(crate) fn machine_in(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
-        self.hypothesis.machine_in(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
+    pub fn machine(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
+        self.hypothesis.machine(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
     }
 
     /// The same on its orbit.
@@ -277,7 +276,7 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn machine_on_orbit(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
-        let (machine, drives) = self.machine_in(data, campaign)?;
+        let (machine, drives) = self.machine(data, campaign)?;
         Ok((machine.on_orbit(&drives.orbit), drives))
     }
 
@@ -291,7 +290,7 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn tunes_of_element(&self, data: &Data) -> Result<[f64; 2], EffectError> {
-        let (machine, drives) = self.machine(data)?;
+        let (machine, drives) = self.machine(data, 0)?;
         let prediction = of_element(self.data(data), &self.hypothesis, 0, (&machine, &drives), &self.u)?;
         Ok(prediction.map_or([0.0; 2], |prediction| prediction.tunes))
     }
@@ -299,25 +298,17 @@ impl Fitted {
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
     pub(crate) fn is_stable(&self, data: &Data) -> bool {
         let keeps = |campaign: usize| {
-            self.machine_in(data, campaign).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
+            self.machine(data, campaign).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
         };
         (0..data.count()).all(keeps)
     }
 
-    /// Predictions at the best point, rows pools, columns monitors [m], then the two tunes [1].
+    /// Predictions at the best point for one of the recordings, rows pools, columns monitors [m], then the two tunes [1].
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn predicted(&self, data: &Data) -> Result<DMatrix<f64>, EffectError> {
-        self.predicted_in(data, 0)
-    }
-
-    /// The same in one of several recordings.
-    ///
-    /// # Errors
-    /// [`EffectError`].
-    pub(crate) fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
-        Ok(self.predicted_at(data, campaign, &self.u)?.by_frame())
+    pub fn predicted(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
+        Ok(predicted_by(data, &self.hypothesis, campaign, &self.u)?.by_frame())
     }
 
     /// Whitened residuals of some data at the best point of this fit, which may be of others.
@@ -325,16 +316,12 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn residual_of(&self, data: &Data) -> Result<DVector<f64>, EffectError> {
-        data.stacked(|campaign, own| Ok(own.residual(&self.predicted_at(data, campaign, &self.u)?)))
+        data.stacked(|campaign, own| Ok(own.residual(&predicted_by(data, &self.hypothesis, campaign, &self.u)?)))
     }
 
     /// Its cost for other readings; infinite where its machine keeps no beam in them.
     pub(crate) fn cost_of(&self, data: &Data) -> f64 {
         self.residual_of(data).map_or(f64::INFINITY, |residual| residual.norm_squared() + self.u.norm_squared())
-    }
-
-    fn predicted_at(&self, data: &Data, campaign: usize, u: &DVector<f64>) -> Result<Signature, EffectError> {
-        predicted_by(data, &self.hypothesis, campaign, u)
     }
 
     /// Sum of (residual/noise)^2 over the readings of monitors in state ok, about baselines that follow supplies and RF (and drift), per
@@ -346,7 +333,7 @@ impl Fitted {
         let data = self.data(data);
         let (mut sum, mut degrees) = (0.0, 0.0);
         for (campaign, own) in data.campaigns().enumerate() {
-            let (chi2, freedom) = own.chi_square(&self.predicted_in(data, campaign)?);
+            let (chi2, freedom) = own.chi_square(&self.predicted(data, campaign)?);
             (sum, degrees) = (sum + chi2, degrees + freedom);
         }
         Ok(sum / (degrees - self.params.len() as f64))
@@ -488,7 +475,7 @@ fn machine_at(
     campaign: usize,
     u: &DVector<f64>,
 ) -> Result<(Machine, Drives), EffectError> {
-    hypothesis.machine_in(data, campaign, &hypothesis.units(data).params(u), &u.as_slice()[data.units.len()..])
+    hypothesis.machine(data, campaign, &hypothesis.units(data).params(u), &u.as_slice()[data.units.len()..])
 }
 
 /// What a hypothesis predicts in a recording: its machine, and to first order about that its unknown element. How the vars change what the element does is
@@ -529,16 +516,19 @@ pub fn of_element(
     let unknowns = hypothesis.unknowns(data);
     let forms = unknowns.iter().zip(u.iter().skip(data.units.len()));
     let forms = forms.filter(|(unknown, _)| matches!(unknown, Unknown::Form(..)));
-    let mut sum: Option<Signature> = None;
-    for (unknown, u) in forms {
-        let Some(form) = of_linear(data, campaign, &signatures, unknown, *u)? else { continue };
-        let form = form * *u;
-        match &mut sum {
-            None => sum = Some(form),
-            Some(sum) => *sum += form,
-        }
+    summed(forms.filter_map(|(unknown, u)| {
+        let form = of_linear(data, campaign, &signatures, unknown, *u).transpose()?;
+        Some(form.map(|form| form * *u))
+    }))
+}
+
+/// The sum of some signatures, if there are any.
+fn summed(mut each: impl Iterator<Item = Result<Signature, EffectError>>) -> Result<Option<Signature>, EffectError> {
+    let Some(mut sum) = each.next().transpose()? else { return Ok(None) };
+    for one in each {
+        sum += one?;
     }
-    Ok(sum)
+    Ok(Some(sum))
 }
 
 /// What a machine predicts.
@@ -562,8 +552,10 @@ fn of_linear(
 ) -> Result<Option<Signature>, EffectError> {
     match unknown {
         Unknown::Ordinary(member, width) if member.is_in(campaign) => {
-            let one_more = together(signatures, member, |kind| data.scale(campaign, kind))?;
-            Ok(Some(one_more * (width / member.factor(u * width))))
+            let of_term =
+                |term: &Term| Ok(signatures.of_effect(term.kind, term.site)? * data.scale(campaign, term.kind));
+            let one_more = summed(member.terms.iter().map(of_term))?;
+            Ok(one_more.map(|one_more| one_more * (width / member.factor(u * width))))
         }
         Unknown::Form(quadrupole, form, sigma) => {
             // as a field that is no magnet of the ring
@@ -572,23 +564,6 @@ fn of_linear(
         }
         _ => Ok(None),
     }
-}
-
-/// The sum of the signatures of effects that share an amplitude, each by the scale of its kind.
-fn together(
-    signatures: &Signatures,
-    member: &Member,
-    scale: impl Fn(EffectKind) -> f64,
-) -> Result<Signature, EffectError> {
-    let signature = |term: &Term| -> Result<Signature, EffectError> {
-        Ok(signatures.of_effect(term.kind, term.site)? * scale(term.kind))
-    };
-    let mut of_each = member.terms.iter().map(signature);
-    let first = of_each.next().expect("a family has members")?;
-    of_each.try_fold(first, |mut sum, one| {
-        sum += one?;
-        Ok(sum)
-    })
 }
 
 impl Objective for Problem<'_> {
@@ -625,9 +600,7 @@ impl Objective for Problem<'_> {
 }
 
 /// Derivative at 0. Next to a resonance one side has no stable machine, and the other one serves alone.
-fn difference<T: Sub<Output = T> + Mul<f64, Output = T>>(
-    at: impl Fn(f64) -> Result<T, EffectError>,
-) -> Result<T, EffectError> {
+fn difference(at: impl Fn(f64) -> Result<DVector<f64>, EffectError>) -> Result<DVector<f64>, EffectError> {
     match (at(DIFFERENCE), at(-DIFFERENCE)) {
         (Ok(above), Ok(below)) => Ok((above - below) * (2.0 * DIFFERENCE).recip()),
         (Ok(above), Err(_)) => Ok((above - at(0.0)?) * DIFFERENCE.recip()),

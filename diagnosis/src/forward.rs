@@ -99,7 +99,7 @@ impl Standard {
         let hypothesis = Hypothesis { given: vec![effect], ..Hypothesis::default() };
         let mut fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(data.units.len())).unwrap();
         for _ in 0..PASSES {
-            let (machine, drives) = fitted.machine(&data).unwrap();
+            let (machine, drives) = fitted.machine(&data, 0).unwrap();
             data.linearise_about(&machine, &drives.orbit).unwrap();
             fitted = Fitted::from_guess(&data, &hypothesis, &fitted.u).unwrap();
         }

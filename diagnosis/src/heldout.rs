@@ -23,8 +23,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::choice::Choice;
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::Hypothesis;
 use super::linearisation::about_itself;
 use super::scan::SignatureScore;

@@ -165,19 +165,12 @@ impl Hypothesis {
         self.terms.contains(term) || self.element.as_ref().is_some_and(|element| element.holds(term, ring))
     }
 
-    /// The machine and its drives at given `ln` vars and values of the unknowns in units of their standard deviations, without the unknown element.
+    /// The machine in one of the recordings and its drives, at given `ln` vars and values of the unknowns in units of their standard deviations, without the
+    /// unknown element.
     ///
     /// # Errors
     /// [`EffectError`] if an effect is not defined at its place.
-    pub fn machine(&self, data: &Data, params: &[f64], unknown: &[f64]) -> Result<(Machine, Drives), EffectError> {
-        self.machine_in(data, 0, params, unknown)
-    }
-
-    /// The same in one of several recordings.
-    ///
-    /// # Errors
-    /// [`EffectError`] if an effect is not defined at its place.
-    pub(crate) fn machine_in(
+    pub fn machine(
         &self,
         data: &Data,
         campaign: usize,
@@ -206,12 +199,6 @@ impl Hypothesis {
         effects.iter().for_each(|effect| correct_orbit(recording, &mut drives, effect));
         let ring = recording.ring.with_strengths(&recording.ring.strengths(params, &recording.supplies));
         Ok((Machine::new(ring, recording.believed, &effects)?, drives))
-    }
-
-    /// `kind@place + kind@place`, or `nothing`.
-    pub fn label(&self, ring: &Ring) -> String {
-        let terms: Vec<String> = self.terms.iter().map(|term| term.label(ring)).collect();
-        if terms.is_empty() { "nothing".into() } else { terms.join(" + ") }
     }
 }
 

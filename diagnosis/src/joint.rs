@@ -161,7 +161,7 @@ impl Data {
     pub(crate) fn linearise_each(&mut self, fitted: &Fitted) -> Result<f64, EffectError> {
         let (mut linearised, mut moved) = (self.clone(), 0.0);
         for campaign in 0..self.count() {
-            let (machine, drives) = fitted.machine_in(self, campaign)?;
+            let (machine, drives) = fitted.machine(self, campaign)?;
             moved += linearised.campaign_mut(campaign).linearise_about(&machine, &drives.orbit)?;
         }
         *self = linearised;

@@ -7,8 +7,7 @@
 use nalgebra::DVector;
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::Hypothesis;
 
 /// Most linearisations of a fit, and the chi-square of the change by one that calls for the next.

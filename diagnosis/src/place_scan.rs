@@ -9,8 +9,7 @@ use core::convert::Infallible;
 use twin::{Place, Thin};
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::scan::{BATCH, Projection, SignatureScore, of_each};
 
 /// Longest segment [m], and longest where the gradient may be.
@@ -201,7 +200,7 @@ mod tests {
             let mut data = Data::from_campaign(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
             let fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(48)).unwrap();
-            let (machine, drives) = fitted.machine(&data).unwrap();
+            let (machine, drives) = fitted.machine(&data, 0).unwrap();
             data.linearise_about(&machine, &drives.orbit).unwrap();
             let fitted = Fitted::from_guess(&data, &hypothesis, &fitted.u).unwrap();
             let scan = PlaceScan::from_fit(&data, &fitted, Some(0), thin).unwrap();

@@ -14,9 +14,8 @@ use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{Drives, EffectKind, Machine, Signatures, Site};
 
 use super::data::Data;
-use super::error::FitError;
 use super::family::members;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::term::Term;
 
 /// One candidate.

@@ -4,9 +4,8 @@ use nalgebra::DVector;
 
 use crate::alternatives::Alternative;
 use crate::data::Data;
-use crate::error::FitError;
 use crate::family::Family;
-use crate::fit::Fitted;
+use crate::fit::{FitError, Fitted};
 use crate::hypothesis::Hypothesis;
 use crate::linearisation::{self, about_itself};
 use crate::scan::Candidate;
@@ -177,7 +176,7 @@ pub fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     if fitted.is_poor() && !lacks_all {
         return fitted;
     }
-    let kept = fitted.has_own().then(|| fitted.data(data).clone());
+    let kept = fitted.own.as_deref().cloned();
     let data = kept.as_ref().unwrap_or(data);
     let again =
         |hypothesis: Hypothesis, from: &Fitted| Fitted::from_guess(data, &hypothesis, &from.guess(data, &hypothesis));

@@ -54,7 +54,8 @@ impl Fit {
         let vars = fitted.params.len();
         let design = Functions::of(&Optics::of(&data.ring, Hold::Momentum { delta: 0.0 })?)?;
         let at = |u: &DVector<f64>| -> Result<DVector<f64>, EffectError> {
-            let (machine, drives) = fitted.hypothesis.machine(data, &fitted.units.params(u), &u.as_slice()[vars..])?;
+            let (machine, drives) =
+                fitted.hypothesis.machine(data, 0, &fitted.units.params(u), &u.as_slice()[vars..])?;
             Ok(Functions::of(&machine.on_orbit(&drives.orbit).optics()?)?.against(&design))
         };
         let best = at(&fitted.u)?;
