@@ -11,6 +11,7 @@
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, EffectError, EffectKind, Machine, Measured, OrbitError, Signature, Signatures};
 
+use super::columns::beside;
 use super::data::Data;
 use super::element::Form;
 use super::family::Family;
@@ -168,7 +169,7 @@ impl Fitted {
         slopes: DMatrix<f64>,
     ) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.hypothesis.units(problem.data));
-        let jacobian = problem.ordinary.beside(slopes);
+        let jacobian = beside(slopes, &problem.ordinary.slopes);
         let params = units.params(&u);
         let slope = jacobian.tr_mul(&residual) - &u;
         let within = BoundedGaussian::from_precision(&factor, &u, slope, &units);
@@ -199,7 +200,7 @@ impl Fitted {
     pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
         let problem = Problem::new(self.data(data), &self.hypothesis, u)?;
         let residual = problem.residual(u)?;
-        let slope = problem.ordinary.beside(problem.jacobian(u)?).tr_mul(&residual) - u;
+        let slope = beside(problem.jacobian(u)?, &problem.ordinary.slopes).tr_mul(&residual) - u;
         Ok((-0.5 * (residual.norm_squared() + u.norm_squared()), slope))
     }
 
@@ -346,16 +347,16 @@ impl Fitted {
         &self,
         data: &Data,
         other: &Hypothesis,
-        beside: &[Family],
+        more: &[Family],
     ) -> Result<(DVector<f64>, DMatrix<f64>), FitError> {
         let data = self.data(data);
         let (own, others) = (self.hypothesis.unknowns(data), other.unknowns(data));
         let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma() / own.sigma());
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
-        let besides: Vec<Unknown> = beside.iter().flat_map(|family| family.unknowns(data)).collect();
+        let besides: Vec<Unknown> = more.iter().flat_map(|family| family.unknowns(data)).collect();
         let machine = |campaign: usize| machine_at(data, &self.hypothesis, campaign, &self.u);
         let none = DVector::zeros(besides.len());
-        let mut all = Ordinary::about(data, &besides, &none, machine)?.beside(self.jacobian.clone());
+        let mut all = beside(self.jacobian.clone(), &Ordinary::about(data, &besides, &none, machine)?.slopes);
         all.column_iter_mut().zip(&wider).for_each(|(mut column, wider)| column *= *wider);
         let left = &self.residual + &self.jacobian * &self.u;
         let identity = DMatrix::identity(all.ncols(), all.ncols());
@@ -457,14 +458,6 @@ impl Ordinary {
         })?;
         let gram = gram(&slopes);
         Ok(Self { slopes, gram })
-    }
-
-    /// The derivatives of all unknowns, from those of the others.
-    fn beside(&self, others: DMatrix<f64>) -> DMatrix<f64> {
-        let first = others.ncols();
-        let mut all = others.insert_columns(first, self.slopes.ncols(), 0.0);
-        all.columns_range_mut(first..).copy_from(&self.slopes);
-        all
     }
 }
 

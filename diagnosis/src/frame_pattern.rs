@@ -21,8 +21,9 @@ use core::f64::consts::{E, FRAC_PI_2, LN_2};
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Optics, OrbitError, Plane, Ring};
 
+use super::columns::beside;
 use super::factors::{Factors, Seen};
-use super::jitter::{Differences, with_column};
+use super::jitter::Differences;
 use super::laplace::Peak;
 use super::period::Period;
 
@@ -240,7 +241,7 @@ fn known_shape<'s>(near: &Differences, known: &DMatrix<f64>, shapes: &'s [Shape]
     let without = near.log_likelihood(known);
     let with = |shape: &Shape, size: f64| {
         let columns = shape.columns.column_iter().map(|column| column * size);
-        near.log_likelihood(&columns.fold(known.clone(), |modes, column| with_column(&modes, &column))) - without
+        near.log_likelihood(&columns.fold(known.clone(), |modes, column| beside(modes, &column))) - without
     };
     let range = -SMALLEST.ln();
     let sizes = (0..SIZES).map(|i| -range * (i as f64 + 0.5) / SIZES as f64);
@@ -503,7 +504,8 @@ mod tests {
             }
             all.iter_mut().skip(campaign).step_by(57).for_each(|z| *z = f64::NAN);
             let cost = 0.5 * 240_f64.ln();
-            let known = [Known { modes: none.clone(), cost: 0.0 }, Known { modes: with_column(&none, &jitter), cost }];
+            let known =
+                [Known { modes: none.clone(), cost: 0.0 }, Known { modes: beside(none.clone(), &jitter), cost }];
             let noise = vec![Some(case.noise.noise); monitors];
             logs.push(
                 Found::strongest(&Differences::from_frames(all), &known, &case.shapes, &noise)

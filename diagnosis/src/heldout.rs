@@ -155,7 +155,7 @@ impl<'d> Precision<'d> {
         let mut start = 0;
         let mut channels = Vec::new();
         for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
-            for (c, channel) in own.channels().iter().enumerate() {
+            for (c, channel) in own.channels.iter().enumerate() {
                 let n = channel.rows.len();
                 let back = channel.whiten(DMatrix::identity(n, n)).transpose();
                 let (jacobian, residual) = (fitted.jacobian.rows(start, n), fitted.residual.rows(start, n));
@@ -225,12 +225,12 @@ impl<'d> Precision<'d> {
         Ok(pulls.iter().zip(powers).map(|(&pull, power)| SignatureScore { pull, power }).collect())
     }
 
-    /// `ln` of the determinant of what monitors have in common in a block's pools.
+    /// `ln` of the determinant of what monitors have in common in a block's pools, in units of their own noise.
     fn mixed_log_det(&self, block: &Block) -> f64 {
         let of_each = self.data.campaigns().zip(self.data.pools_of_each()).map(|(own, pools)| {
             let inside: Vec<usize> = block.iter().filter_map(|pool| pool.checked_sub(pools.start)).collect();
             let inside: Vec<usize> = inside.into_iter().filter(|pool| *pool < own.pools.count).collect();
-            own.mixed_log_det(&inside)
+            inside.into_iter().map(|pool| own.mixing.log_det_of(pool)).sum::<f64>()
         });
         of_each.sum()
     }

@@ -16,6 +16,7 @@ mod chance;
 mod channel;
 mod choice;
 mod close_tunes;
+mod columns;
 mod common_factors;
 mod data;
 mod diagnosis;

@@ -20,6 +20,7 @@ use evidence::{Factor, gram};
 use nalgebra::{DMatrix, DMatrixView, DVector, Matrix2, Vector2};
 use twin::{EffectError, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring};
 
+use super::columns::beside;
 use inference::recording::Recording;
 use inference::{Drive, Prior};
 
@@ -243,13 +244,7 @@ fn responses(machine: &Machine, ring: &Ring) -> Result<[[DMatrix<f64>; 2]; 2], O
     Ok(observers.each_ref().map(|observers| {
         // as if a loop were open for the steps
         let rf = optics.dispersion_of(observers) / -optics.slip_factor();
-        sources.each_ref().map(|sources| {
-            let response = held.response(&optics, observers, sources);
-            let at = response.ncols();
-            let mut response = response.insert_column(at, 0.0);
-            response.set_column(at, &rf);
-            response
-        })
+        sources.each_ref().map(|sources| beside(held.response(&optics, observers, sources), &rf))
     }))
 }
 

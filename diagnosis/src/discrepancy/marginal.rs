@@ -4,6 +4,7 @@ use evidence::{Evidence, Factor, gram, log_bayes_factor};
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 use super::sums::{Apart, Sums};
+use crate::columns::beside;
 use crate::fit::Fitted;
 use crate::location::Location;
 
@@ -82,7 +83,7 @@ impl<'f> Linearised<'f> {
 
     pub fn taken_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
         let sides: Vec<DMatrix<f64>> =
-            each.iter().map(|sums| sums.with_column(&(&sums.pull - &sums.cross * &self.slope))).collect();
+            each.iter().map(|sums| beside(sums.cross.clone(), &(&sums.pull - &sums.cross * &self.slope))).collect();
         let logs = SIZES.map(|size| self.marginal_apart(&sides, apart, size).unwrap_or(f64::NEG_INFINITY));
         self.conclude(at, logs, sites, &each.iter().collect::<Vec<_>>())
     }
