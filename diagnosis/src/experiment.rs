@@ -1,6 +1,6 @@
 //! Experiment design: how well one more campaign of the same length would separate two causes.
 //!
-//! The expected `ln` Bayes factor of the true cause over its rival ([`Rivals`]), from the whitened signatures of the present and
+//! The expected `ln` Bayes factor of the true cause over its rival ([`expected`]), from the whitened signatures of the present and
 //! the new campaign together, all vars adapting.
 
 use nalgebra::{DMatrix, DVector};
@@ -8,7 +8,7 @@ use twin::{Drives, Machine, Quadrupole, Signatures};
 
 use super::data::Data;
 use super::fit::{FitError, Fitted};
-use super::scan::Rivals;
+use super::scan::expected;
 use super::term::Term;
 
 /// What a possible measurement changes of the present one.
@@ -196,5 +196,5 @@ fn separation(campaigns: &[&Derivatives], amplitude: f64, free: [bool; 2]) -> f6
     let taken = factor.solve(&with_one);
     let (h, c) = (one - with_one.dot(&taken), both - with_other.dot(&taken));
     let rival = other - with_other.dot(&factor.solve(&with_other));
-    Rivals { power: h, rival, both: c, free }.expected(amplitude)
+    expected(amplitude, [h, c, rival], free)
 }

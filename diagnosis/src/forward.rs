@@ -106,7 +106,7 @@ impl Standard {
         let (machine, drives) = fitted.machine_on_orbit(&data, 0).unwrap();
         let signature = Signatures::of(&machine, &drives).unwrap().of_effect(effect.kind, effect.site).unwrap();
         let column = fitted.data(&data).signature(&signature) * effect.kind.prior_scale().unwrap_or(1.0);
-        let score = Projection::from_fit(&fitted).score(&DMatrix::from_columns(&[column])).scores[0];
+        let score = Projection::from_fit(&fitted).score(&DMatrix::from_columns(&[column])).0[0];
         Some(score.pull / (1.0 + score.power).sqrt())
     }
 
