@@ -84,26 +84,17 @@ impl Alternative {
     pub(super) fn from_candidate(candidate: &Candidate) -> Self {
         let scale = candidate.term.kind.prior_scale();
         let sigma = scale.map_or(0.0, |scale| scale / (1.0 + candidate.power).sqrt());
-        Self {
-            amplitude: (candidate.amplitude * scale.unwrap_or(1.0), sigma),
-            cause: Cause::Effect(candidate.term),
-            log_gain: candidate.log_bayes,
-            probability: 0.0,
-            adapting: &candidate.adapting * candidate.amplitude,
-            fitted: None,
-        }
+        let amplitude = (candidate.amplitude * scale.unwrap_or(1.0), sigma);
+        let adapting = &candidate.adapting * candidate.amplitude;
+        Self { adapting, ..Self::unfitted(Cause::Effect(candidate.term), candidate.log_bayes, amplitude) }
     }
 
     /// One of the terms of a fit, compared with the fit without it.
     pub(super) fn exact(data: &Data, without: &Fitted, fitted: Fitted, term: usize) -> Self {
-        Self {
-            cause: Cause::Effect(fitted.hypothesis.terms[term]),
-            log_gain: fitted.log_evidence - without.log_evidence,
-            probability: 0.0,
-            amplitude: fitted.amplitude(data, term),
-            adapting: DVector::zeros(0),
-            fitted: Some(fitted),
-        }
+        let cause = Cause::Effect(fitted.hypothesis.terms[term]);
+        let log_gain = fitted.log_evidence - without.log_evidence;
+        let amplitude = fitted.amplitude(data, term);
+        Self { fitted: Some(fitted), ..Self::unfitted(cause, log_gain, amplitude) }
     }
 
     /// A cause without a fit of its own, its probability still open.

@@ -26,6 +26,7 @@ use super::factors::{Factors, Seen};
 use super::jitter::Differences;
 use super::laplace::Peak;
 use super::period::Period;
+use super::transients::run_means;
 
 /// What a pattern is like.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -275,27 +276,18 @@ pub fn beyond_chance(log_chance: f64) -> f64 {
 }
 
 /// Amplitudes of the largest of some patterns [m] in each frame, from readings less their prediction about the mean of their run, not a
-/// number where there is none; `noise` of each monitor [m], none for one that does not count.
-pub fn amplitudes(patterns: &DMatrix<f64>, residual: &DMatrix<f64>, noise: &[Option<f64>], runs: &[usize]) -> Vec<f64> {
+/// number where there is none; `noise` of each monitor [m], none for one that does not count. `settings`: that of each frame.
+pub fn amplitudes(
+    patterns: &DMatrix<f64>,
+    residual: &DMatrix<f64>,
+    noise: &[Option<f64>],
+    settings: &[Option<usize>],
+) -> Vec<f64> {
     let monitors: Vec<usize> = (0..noise.len()).filter(|&b| noise[b].is_some()).collect();
     let weight = |b: usize| noise[b].map_or(0.0, |noise| noise.powi(-2));
     let largest = patterns.clone().svd(false, true).v_t.map(|v| patterns * v.row(0).transpose());
     let Some(pattern) = largest else { return vec![f64::NAN; residual.nrows()] };
-    let mut about = residual.clone();
-    for &b in &monitors {
-        let mut column = about.column_mut(b);
-        let mut start = 0;
-        for end in 1..=runs.len() {
-            if end < runs.len() && runs[end] == runs[start] {
-                continue;
-            }
-            let mut run = column.rows_range_mut(start..end);
-            let known: Vec<f64> = run.iter().copied().filter(|value| !value.is_nan()).collect();
-            let mean = known.iter().sum::<f64>() / known.len() as f64;
-            run.add_scalar_mut(-mean);
-            start = end;
-        }
-    }
+    let about = residual - run_means(residual, settings);
     let amplitude = |row: usize| {
         let seen = monitors.iter().filter(|&&b| !about[(row, b)].is_nan());
         let sum = |(pull, information): (f64, f64), &b: &usize| {

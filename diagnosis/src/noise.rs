@@ -11,6 +11,8 @@
 //! tails of Student's t with four degrees of freedom, but their chi-square would no longer be their number, and two repeats cannot tell which
 //! is the outlier.
 
+use core::ops::Range;
+
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
@@ -25,6 +27,7 @@ use super::period::Period;
 use super::repeats::{Repeats, Run};
 use super::scale::{ALIKE, QUOTED, Scales};
 use super::slow_noise::{SHARE, Slow, steps};
+use super::transients::runs;
 use inference::Campaign;
 use inference::{Imperfection, Measure, POSITION};
 
@@ -284,13 +287,13 @@ impl Noise {
         if square == 0.0 {
             return None;
         }
-        let runs = runs(&campaign.settings.repeatable);
+        let settings = &campaign.settings.repeatable;
         let mut residual = source.residual.clone();
         for (frame, mut row) in residual.row_iter_mut().enumerate() {
             let missing = (0..own.len()).filter(|&b| !campaign.counts(frame, b));
             missing.for_each(|b| row[b] = f64::NAN);
         }
-        let period = Period::find(&frame_pattern::amplitudes(moving, &residual, &own, &runs), &runs);
+        let period = Period::find(&frame_pattern::amplitudes(moving, &residual, &own, settings), &runs(settings));
         let of_period = period.map_or(f64::NEG_INFINITY, |one| frame_pattern::beyond_chance(one.log_chance));
         let log_bayes = match (like, &found) {
             (Like::Momentum, _) | (_, None) => {
@@ -462,7 +465,8 @@ fn orders(campaign: &Campaign, learners: &[Learner]) -> [Vec<usize>; 2] {
 fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
     let campaign = source.campaign;
     let settings = &campaign.settings.repeatable;
-    let apart: Vec<Option<usize>> = runs(settings).into_iter().map(Some).collect();
+    let number = |(i, run): (usize, Range<usize>)| run.map(move |_| Some(i));
+    let apart: Vec<Option<usize>> = runs(settings).into_iter().enumerate().flat_map(number).collect();
     let (runs, apart) = (Run::from_settings(settings), Run::from_settings(&apart));
     let learner = |b: usize| {
         let frames: Vec<usize> = (0..campaign.frames()).filter(|&frame| campaign.counts(frame, b)).collect();
@@ -494,16 +498,6 @@ fn differences(
         }
     }
     all
-}
-
-/// The run of consecutive frames of one setting that each frame is in.
-fn runs(settings: &[Option<usize>]) -> Vec<usize> {
-    let mut run = 0;
-    let run_of_frame = |i: usize| {
-        run += usize::from(i > 0 && (settings[i].is_none() || settings[i] != settings[i - 1]));
-        run
-    };
-    (0..settings.len()).map(run_of_frame).collect()
 }
 
 /// Kurtosis of differences, 3 for normal noise [1].

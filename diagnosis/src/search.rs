@@ -26,10 +26,10 @@ use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::element::Element;
 use super::fit::{FitError, Fitted};
-use super::heldout::{lessened, reduced};
+use super::heldout::lessened;
 use super::hypothesis::Hypothesis;
 use super::linearisation::{self, CURVED};
-use super::odds::{ODDS, SORTS, TOO_SMALL, UNMODELLED, UNMODELLED_SEEN, log_prior, odds_beside};
+use super::odds::{ODDS, TOO_SMALL, UNMODELLED, log_prior, log_prior_unmodelled, odds_beside};
 use super::scan::{Candidate, scan};
 use super::term::Term;
 use super::widths;
@@ -66,7 +66,7 @@ fn not_needed(found: &Found, further: &Found) -> Option<Competition> {
 
 /// Correction of a first search for an unmodelled discrepancy: the `ln` Bayes factor that gives even odds.
 pub fn correction_of(discrepancy: &Discrepancy) -> f64 {
-    -(UNMODELLED_SEEN * ODDS / (SORTS * discrepancy.sites) as f64).ln()
+    -log_prior_unmodelled(ODDS, discrepancy.sites)
 }
 
 /// The candidates of a recording, with their prior.
@@ -258,7 +258,7 @@ impl Search {
 
     /// The competition of one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
-        let rest = relearnt(data, reduced(data, fitted, term)?);
+        let rest = relearnt(data, lessened(data, fitted, fitted.hypothesis.without(term))?);
         // the others are fitted to the readings of the rest
         let present = if data.is_about_effects { fitted.clone().keeping(data) } else { fitted.clone() };
         let present = Alternative::exact(data, &rest, present, term);
@@ -310,8 +310,7 @@ impl Search {
         relearn(data, fitted, &mut weights, &outstanding);
         // by its prior each weighs less than its evidence
         for discrepancy in discrepancy::scan(data, fitted, least_weight(&weights))? {
-            let prior = (UNMODELLED_SEEN * odds / (SORTS * discrepancy.sites) as f64).ln();
-            let weight = discrepancy.log_bayes + prior;
+            let weight = discrepancy.log_bayes + log_prior_unmodelled(odds, discrepancy.sites);
             weights.push((Alternative::unmodelled(discrepancy), weight));
         }
         weigh_elements(data, fitted, &mut weights)?;

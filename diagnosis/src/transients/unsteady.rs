@@ -14,8 +14,8 @@ use core::ops::Range;
 use evidence::log_bayes_factor_of_alike;
 use nalgebra::{DMatrix, DVector};
 
+use super::Shown;
 use super::differences::Differences;
-use super::shown::Shown;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::location::Location;
 
