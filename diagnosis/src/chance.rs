@@ -49,7 +49,7 @@ mod tests {
 
     use super::*;
     use crate::data::Data;
-    use crate::heldout::{gain_of_choice, reduced};
+    use crate::heldout::{gain_of_choice, lessened};
     use crate::odds::corrections;
     use crate::scan::candidates;
     use crate::search::{Found, Search};
@@ -63,7 +63,10 @@ mod tests {
         let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
         let terms = candidates(&data, None);
         let Found { data, null, best, .. } = Search::new(terms.clone()).run(data).unwrap();
-        let fitted = if best.hypothesis.terms.is_empty() { null } else { reduced(&data, &best, 0).unwrap() };
+        let fitted = match best.hypothesis.terms.is_empty() {
+            true => null,
+            false => lessened(&data, &best, best.hypothesis.without(0)).unwrap(),
+        };
         let penalty = corrections(&terms);
         let choice = Choice::from_terms(&data, &fitted, &terms, &penalty).unwrap();
         (of_search(&choice).unwrap(), gain_of_choice(&choice).unwrap())

@@ -90,7 +90,11 @@ impl Diagnosis {
         let data = &found.data;
         progress("held-out frames");
         let blocks = heldout::by_pool(data);
-        let bare = if found.has_more() { heldout::bare(data, &found.best)? } else { found.null.clone() };
+        let (best, all) = (&found.best, &found.best.hypothesis);
+        let bare = match found.has_more() {
+            true => heldout::without_terms(data, best, &all.terms, &all.without_element())?,
+            false => found.null.clone(),
+        };
         let before = Score::from_blocks(data, &bare, &blocks)?;
         let after = if found.has_more() { Score::from_blocks(data, &found.best, &blocks)? } else { before.clone() };
         let tests = verdict::tests(data, &found, &candidates, (&bare, &before), &after, &blocks)?;

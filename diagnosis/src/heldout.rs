@@ -99,11 +99,6 @@ impl Score {
         Ok(Self { log_density, rms: (squares / ok.max(1) as f64).sqrt(), inside: inside.map(|count| count / n) })
     }
 
-    /// Readings of monitors and of the tune meter: means of pools.
-    pub fn readings(&self) -> usize {
-        self.log_density.len()
-    }
-
     /// Expected log predictive density.
     pub fn elpd(&self) -> f64 {
         self.log_density.iter().sum()
@@ -288,40 +283,26 @@ pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
     Ok(gain)
 }
 
-/// The same fit without its effects and its unknown element, what is ordinary being of the same size.
-pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
-    without_terms(data, fitted, &fitted.hypothesis.terms, &fitted.hypothesis.without_element())
-}
-
-/// The same fit without one of its terms, to compare its predictions with.
-pub fn rival(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
-    without_terms(data, fitted, &fitted.hypothesis.terms[term..=term], &fitted.hypothesis)
-}
-
-/// The fit of a hypothesis without some terms, and without the families that predict as these do.
-fn without_terms(data: &Data, fitted: &Fitted, terms: &[Term], from: &Hypothesis) -> Result<Fitted, FitError> {
+/// The fit of a hypothesis without some terms, and without the families that predict as these do, to compare its predictions with: what is ordinary keeps the
+/// size that it has in another fit.
+pub(super) fn without_terms(
+    data: &Data,
+    fitted: &Fitted,
+    terms: &[Term],
+    from: &Hypothesis,
+) -> Result<Fitted, FitError> {
     let less = from.without_terms(|term| terms.contains(term));
     lessened(data, fitted, terms.iter().fold(less, |less, term| less.without_family(*term, data)))
 }
 
-/// The same fit without one of its terms.
-pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
-    lessened(data, fitted, fitted.hypothesis.without(term))
-}
-
-/// The fit of a hypothesis with fewer effects.
+/// The fit of a hypothesis with fewer effects than another fit: vars that are stable with an effect may be unstable without it, and so may ordinary
+/// imperfections that grow in its place.
 pub(super) fn lessened(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
-    let less = from_near_or_far(data, fitted, other)?;
-    Ok(if data.is_about_effects { about_itself(data, less) } else { less })
-}
-
-/// The fit of another hypothesis: vars that are stable with an effect may be unstable without it, and so may ordinary imperfections that grow
-/// in its place.
-fn from_near_or_far(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
     let far = DVector::zeros(fitted.params.len());
     let stable = |fitted: &Fitted| fitted.is_stable(data);
     let near = Fitted::from_guess(data, &other, &fitted.guess(data, &other)).ok().filter(stable);
     let other_than_near = || Fitted::from_guess(data, &other, &far).ok().filter(stable);
     let bare = Hypothesis { ordinary: Vec::new(), ..other.clone() };
-    near.or_else(other_than_near).map_or_else(|| Fitted::from_guess(data, &bare, &far), Ok)
+    let less = near.or_else(other_than_near).map_or_else(|| Fitted::from_guess(data, &bare, &far), Ok)?;
+    Ok(if data.is_about_effects { about_itself(data, less) } else { less })
 }

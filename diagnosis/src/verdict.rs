@@ -11,7 +11,7 @@ use super::data::Data;
 use super::experiment::Menu;
 use super::family::family_of;
 use super::fit::{FitError, Fitted};
-use super::heldout::{Block, Score, gain_of_choice, lessened, rival};
+use super::heldout::{Block, Score, gain_of_choice, lessened, without_terms};
 use super::limits::Limits;
 use super::location::Location;
 use super::lost_frames::lost_frames;
@@ -308,13 +308,17 @@ pub fn tests(
     let test = |i: usize| -> Result<Tested, FitError> {
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
         let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
-        let without = &if is_all { bare.clone() } else { rival(data, &found.best, i)? };
+        let hypothesis = &found.best.hypothesis;
+        let without = &match is_all {
+            true => bare.clone(),
+            false => without_terms(data, &found.best, &hypothesis.terms[i..=i], hypothesis)?,
+        };
         let rival = if is_all { before } else { &Score::from_blocks(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_poor() {
             return Ok(Tested { gain, of_choice: None, chance: None, is_of_family: false });
         }
-        let kind = found.best.hypothesis.terms[i].kind;
+        let kind = hypothesis.terms[i].kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
         let kind_of_family = family_of(kind);
         let is_learnt =
