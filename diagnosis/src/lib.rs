@@ -40,6 +40,7 @@ mod limits;
 mod linearisation;
 mod location;
 mod lost_frames;
+mod median;
 mod memory;
 mod modes;
 mod noise;

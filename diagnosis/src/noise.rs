@@ -21,6 +21,7 @@ use super::columns::beside;
 use super::frame_pattern::{self, Found, FrameToFrame, Known, Like, Shape};
 use super::jitter::{CRATE, Crate, Differences, groups, with_crates};
 use super::levels::{Levels, Part};
+use super::median::upper_median;
 use super::memory::Memory;
 use super::odds::{SUSPICIOUS, correction_of_sort};
 use super::period::Period;
@@ -175,9 +176,8 @@ impl Noise {
     /// With the common scale as the screening weights the monitors, their median: where it calls all of them noisy nothing else is known.
     fn at_weights(self, campaign: &Campaign) -> Self {
         let header = &campaign.recording.header.noise;
-        let mut scales: Vec<f64> = self.own.iter().zip(header).map(|(own, header)| own / header).collect();
-        scales.sort_by(f64::total_cmp);
-        let value = scales.get(scales.len() / 2).copied().unwrap_or(1.0);
+        let scales = self.own.iter().zip(header).map(|(own, header)| own / header);
+        let value = upper_median(scales).unwrap_or(1.0);
         Self { common_scale: Measured { value, sigma: 0.0 }, ..self }
     }
 

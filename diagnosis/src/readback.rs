@@ -5,6 +5,7 @@
 //! it is off in these frames; in the others, with the median of itself. What lies more than half of the largest setting away contradicts: that is
 //! halfway between a corrector that is set and one that is not.
 
+use super::median::upper_median;
 use inference::recording::{Recording, Row};
 
 /// Share of a corrector's largest setting that separates set from not set.
@@ -40,16 +41,10 @@ fn contradicting(recording: &Recording, corrector: usize) -> Vec<(usize, f64)> {
     }
     let [set, idle] = [true, false].map(|is_set| {
         let alike = recording.rows.iter().filter(|row| row.setting(corrector).is_some() == is_set);
-        median(alike.map(off).collect())
+        upper_median(alike.map(off)).unwrap_or_default()
     });
     let size = |row: &Row| (off(row) - if row.setting(corrector).is_some() { set } else { idle }).abs();
     recording.rows.iter().map(size).enumerate().filter(|(_, size)| *size > HALF * amplitude).collect()
-}
-
-/// Median, 0 of none.
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
 #[cfg(test)]
