@@ -409,21 +409,21 @@ impl Data {
         data
     }
 
-    /// The same recordings where all monitors wander.
-    pub fn wandering(&self, walk: Measured) -> Self {
+    /// The same recordings where one monitor wanders in one of them, or all do in all.
+    pub(crate) fn wandering(&self, one: Option<(usize, usize)>, walk: Measured) -> Self {
         let mut data = self.clone();
-        data.noise.slow.walk = walk;
-        data.prepare();
-        data.others.iter_mut().for_each(|other| *other = other.wandering(walk));
-        data
-    }
-
-    /// The same recordings where one monitor wanders in one of them.
-    pub(crate) fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
-        let mut data = self.clone();
-        let changed = data.campaign_mut(campaign);
-        changed.noise.wandering.push((monitor, walk));
-        changed.prepare();
+        match one {
+            Some((campaign, monitor)) => {
+                let changed = data.campaign_mut(campaign);
+                changed.noise.wandering.push((monitor, walk));
+                changed.prepare();
+            }
+            None => (0..data.count()).for_each(|campaign| {
+                let changed = data.campaign_mut(campaign);
+                changed.noise.slow.walk = walk;
+                changed.prepare();
+            }),
+        }
         data
     }
 

@@ -12,7 +12,6 @@
 //! with that in the model (`search/element.rs`).
 
 mod element;
-mod found;
 mod refit;
 mod wandering;
 
@@ -34,7 +33,6 @@ use super::scan::{Candidate, scan};
 use super::term::Term;
 use super::widths;
 use element::weigh_elements;
-pub use found::Found;
 use inference::softplus;
 use refit::{
     BEHIND, BEHIND_SHARE, BETTER, WORTH, first_of, fitted_to, null_beside, refit, relearn, relearnt, settled,
@@ -52,6 +50,33 @@ const COMPETITIONS: usize = 40;
 const PLACES: usize = 3;
 /// Number of candidates that are refitted exactly.
 const LEADERS: usize = 8;
+
+/// The result of the search.
+#[derive(Debug, Clone)]
+pub struct Found {
+    /// The recording, linearised about the machine that was found.
+    pub data: Data,
+    /// The fit without any effect.
+    pub null: Fitted,
+    /// The fit with all effects found.
+    pub best: Fitted,
+    /// The alternatives of each effect of `best`, in its order.
+    pub competitions: Vec<Competition>,
+    /// The alternatives of one more effect.
+    pub next: Competition,
+}
+
+impl Found {
+    /// Probability that the model without effects is complete.
+    pub fn nothing(&self) -> f64 {
+        self.competitions.iter().fold(self.next.nothing, |least, competition| least.min(competition.nothing))
+    }
+
+    /// True if the best fit has anything that the one without effects has not.
+    pub fn has_more(&self) -> bool {
+        !self.competitions.is_empty() || self.best.hypothesis.element.is_some()
+    }
+}
 
 /// The competition of the one effect that was added to those found, if it is not needed, and neither is a further one.
 fn not_needed(found: &Found, further: &Found) -> Option<Competition> {

@@ -6,7 +6,7 @@
 
 use twin::Signatures;
 
-use super::found::Found;
+use super::Found;
 use super::refit::{BEHIND, BEHIND_SHARE, WORTH, relearnt};
 use crate::alternatives::{Alternative, Cause};
 use crate::data::Data;
