@@ -18,7 +18,7 @@ use super::family::Family;
 use super::hypothesis::Hypothesis;
 use super::term::Term;
 use super::units::{BoundedGaussian, Units};
-use super::unknown::Unknown;
+use super::unknown::{Quantity, Unknown};
 use evidence::{Factor, gram};
 use inference::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
@@ -233,30 +233,30 @@ impl Fitted {
 
     /// Angle by which its unknown element turns the planes [rad], if that is what it does.
     pub(crate) fn turned(&self, data: &Data) -> Option<Measured> {
-        let (at, scale) = self.find(data, |unknown| matches!(unknown, Unknown::Form(_, Form::Rotation, _)))?;
+        let (at, scale) = self.find(data, |unknown| matches!(unknown.quantity, Quantity::Form(_, Form::Rotation)))?;
         let (value, sigma) = self.sized(at, scale);
         Some(Measured { value, sigma })
     }
 
     /// Index of the amplitude of a term among the unknowns, and its prior standard deviation.
     pub fn unknown(&self, data: &Data, term: usize) -> Option<(usize, f64)> {
-        self.find(data, |unknown| matches!(unknown, Unknown::Amplitude(of, _) if *of == term))
+        let amplitude = Quantity::Amplitude(self.hypothesis.terms[term]);
+        self.find(data, |unknown| unknown.quantity == amplitude)
     }
 
     /// Index of an unknown, the first of a sort, and its prior standard deviation.
     fn find(&self, data: &Data, is_of_sort: impl Fn(&Unknown) -> bool) -> Option<(usize, f64)> {
         let unknowns = self.hypothesis.unknowns(data);
         let at = unknowns.iter().position(is_of_sort)?;
-        Some((self.params.len() + at, unknowns[at].sigma()))
+        Some((self.params.len() + at, unknowns[at].sigma))
     }
 
     /// The best point as the start of a fit of another hypothesis: unknowns that both have keep their values.
     pub fn guess(&self, data: &Data, other: &Hypothesis) -> DVector<f64> {
         let unknowns = self.hypothesis.unknowns(data);
         let value = |unknown: &Unknown| {
-            let same = |(_, one): &(usize, &Unknown)| self.hypothesis.identity(one) == other.identity(unknown);
-            let (i, one) = unknowns.iter().enumerate().find(same)?;
-            Some(self.u[self.params.len() + i] * one.sigma() / unknown.sigma())
+            let at = unknowns.iter().position(|one| one.quantity == unknown.quantity)?;
+            Some(self.u[self.params.len() + at] * unknowns[at].sigma / unknown.sigma)
         };
         let others = other.unknowns(data);
         let units = other.units(data);
@@ -351,7 +351,7 @@ impl Fitted {
     ) -> Result<(DVector<f64>, DMatrix<f64>), FitError> {
         let data = self.data(data);
         let (own, others) = (self.hypothesis.unknowns(data), other.unknowns(data));
-        let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma() / own.sigma());
+        let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma / own.sigma);
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
         let besides: Vec<Unknown> = more.iter().flat_map(|family| family.unknowns(data)).collect();
         let machine = |campaign: usize| machine_at(data, &self.hypothesis, campaign, &self.u);
@@ -427,7 +427,8 @@ impl<'d> Problem<'d> {
             let of_others = of_others.map(|(unknown, u)| of_linear(data, campaign, &signatures, unknown, *u));
             own.signatures(into, of_vars.chain(of_others))
         })?;
-        let is_exact = |i: &usize| matches!(self.unknowns[i - vars], Unknown::Amplitude(..) | Unknown::Orbit(..));
+        let is_exact =
+            |i: &usize| matches!(self.unknowns[i - vars].quantity, Quantity::Amplitude(_) | Quantity::Orbit(..));
         for i in (vars..self.others()).filter(is_exact) {
             let at = |step: f64| {
                 let mut u = u.clone();
@@ -508,7 +509,7 @@ pub fn of_element(
     let signatures = Signatures::of(&machine, drives)?;
     let unknowns = hypothesis.unknowns(data);
     let forms = unknowns.iter().zip(u.iter().skip(data.units.len()));
-    let forms = forms.filter(|(unknown, _)| matches!(unknown, Unknown::Form(..)));
+    let forms = forms.filter(|(unknown, _)| matches!(unknown.quantity, Quantity::Form(..)));
     summed(forms.filter_map(|(unknown, u)| {
         let form = of_linear(data, campaign, &signatures, unknown, *u).transpose()?;
         Some(form.map(|form| form * *u))
@@ -543,14 +544,15 @@ fn of_linear(
     unknown: &Unknown,
     u: f64,
 ) -> Result<Option<Signature>, EffectError> {
-    match unknown {
-        Unknown::Ordinary(member, width) if member.is_in(campaign) => {
+    let Unknown { quantity, sigma } = unknown;
+    match quantity {
+        Quantity::Ordinary(member) if member.is_in(campaign) => {
             let of_term =
                 |term: &Term| Ok(signatures.of_effect(term.kind, term.site)? * data.scale(campaign, term.kind));
             let one_more = summed(member.terms.iter().map(of_term))?;
-            Ok(one_more.map(|one_more| one_more * (width / member.factor(u * width))))
+            Ok(one_more.map(|one_more| one_more * (sigma / member.factor(u * sigma))))
         }
-        Unknown::Form(quadrupole, form, sigma) => {
+        Quantity::Form(quadrupole, form) => {
             // as a field that is no magnet of the ring
             let scale = data.scale(campaign, EffectKind::StrayGradient);
             Ok(Some(form.signature(signatures, &data.ring, *quadrupole) * (*sigma * scale)))
@@ -675,10 +677,11 @@ mod tests {
     /// Largest error of the derivative with respect to an ordinary gain, about one of -30 %, over its largest element.
     fn off_by_differences(data: &Data, hypothesis: &Hypothesis, gain: Term) -> f64 {
         let (vars, unknowns) = (data.units.len(), hypothesis.unknowns(data));
-        let is_it = |unknown: &Unknown| matches!(unknown, Unknown::Ordinary(member, _) if member.terms == [gain]);
+        let is_it =
+            |unknown: &Unknown| matches!(&unknown.quantity, Quantity::Ordinary(member) if member.terms == [gain]);
         let at = vars + unknowns.iter().position(is_it).unwrap();
         let mut start = DVector::zeros(vars + unknowns.len());
-        start[at] = -0.3 / unknowns[at - vars].sigma();
+        start[at] = -0.3 / unknowns[at - vars].sigma;
         let residual = |step: f64| {
             let mut u = start.clone();
             u[at] += step;

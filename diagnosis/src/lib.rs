@@ -94,6 +94,6 @@ pub use search::{Found, correction_of};
 pub use term::Term;
 pub use tested::Tested;
 pub use transients::{Shown, Transient};
-pub use unknown::{Member, Unknown};
+pub use unknown::{Member, Quantity, Unknown};
 pub use verdict::{Finding, Verdict, capitalised, menu};
 pub use wiring::Miswired;

@@ -10,7 +10,7 @@ use crate::hypothesis::Hypothesis;
 use crate::linearisation::{self, about_itself};
 use crate::scan::Candidate;
 use crate::term::Term;
-use crate::unknown::Unknown;
+use crate::unknown::Quantity;
 use crate::widths;
 
 /// Gain of `ln` posterior that calls for another round of competitions, or of widths.
@@ -99,7 +99,8 @@ pub fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) ->
     let mut guess = fitted.guess(data, &hypothesis);
     let unknowns = hypothesis.unknowns(data);
     let last = hypothesis.terms.len() - 1;
-    if let Some(at) = unknowns.iter().position(|unknown| matches!(unknown, Unknown::Amplitude(i, _) if *i == last)) {
+    let amplitude = Quantity::Amplitude(candidate.term);
+    if let Some(at) = unknowns.iter().position(|unknown| unknown.quantity == amplitude) {
         guess[fitted.params.len() + at] = candidate.amplitude;
     }
     let mut guesses = vec![guess];
