@@ -211,10 +211,10 @@ impl Kriged {
 mod tests {
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal};
     use twin::ClosedOrbit;
 
     use super::*;
+    use crate::testing::normal;
 
     /// The orbit at a monitor moves by that share of what its own reading does.
     #[test]
@@ -257,7 +257,7 @@ mod tests {
             let (mut displaced, mut random) = (ring.clone(), StdRng::seed_from_u64(seed));
             let mut longer = 0.0;
             for (quadrupole, k1l) in ring.quadrupoles.iter().zip(ring.integrated_gradients()) {
-                let draw: f64 = StandardNormal.sample(&mut random);
+                let draw = normal(&mut random);
                 displaced.elements[quadrupole.element].misalignment.dx = kick * draw / k1l;
                 longer += kick * draw * optics.dispersion(&optics.observe(quadrupole.element, Plane::X));
             }

@@ -45,22 +45,19 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-
     use super::*;
-    use crate::data::Data;
     use crate::heldout::{gain_of_choice, lessened};
     use crate::odds::corrections;
     use crate::scan::candidates;
     use crate::search::{Found, Search};
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, template, whitened};
     use twin::{Effect, EffectKind};
 
     /// The probability, and the held-out gain of the choice, of a campaign with some effects.
     fn tested(effects: &[Effect], seed: u64) -> (f64, f64) {
         let (ring, recording) = template();
         let made = Coloured::white(&ring, &recording, seed).campaign(&ring, &recording, effects);
-        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = whitened(&ring, &made);
         let terms = candidates(&data, None);
         let Found { data, null, best, .. } = Search::new(terms.clone()).run(data).unwrap();
         let fitted = match best.hypothesis.terms.is_empty() {

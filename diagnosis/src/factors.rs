@@ -196,16 +196,12 @@ impl<'s> Fit<'s> {
 mod tests {
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
+    use crate::testing::normal;
 
     const FRAMES: usize = 240;
     const MONITORS: usize = 30;
-
-    fn normal(random: &mut StdRng) -> f64 {
-        StandardNormal.sample(random)
-    }
 
     /// Differences with some patterns in common, a tenth of them missing.
     fn differences(frames: usize, patterns: &DMatrix<f64>, random: &mut StdRng) -> Seen {

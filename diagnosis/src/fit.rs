@@ -606,17 +606,15 @@ fn difference(at: impl Fn(f64) -> Result<DVector<f64>, EffectError>) -> Result<D
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-
     use super::*;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     /// Readings and kicks are linear in a gain, so that differences are its derivative to rounding; also beside instruments that are exchanged or reversed. Once the fit's machine
     /// had ordinary gains after the exchange and the derivative before it, so that a fit that was begun at its own end moved.
     #[test]
     fn the_derivative_of_a_gain_is_right_about_a_gain() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let beside = [
             "",
             "bpm_swap@y_C5,y_D5=1",
@@ -638,7 +636,7 @@ mod tests {
     #[test]
     fn one_more_effect_is_scored_as_it_is_fitted() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let term = |text: &str| Term::from(twin::Effect::parse(&format!("{text}=1"), &ring).unwrap());
         let (monitors, correctors) = ("bpm_swap@y_C5,y_D5", "corrector_swap@V_D3,V_D7");
         let after = [

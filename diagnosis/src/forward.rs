@@ -10,7 +10,7 @@ use crate::fit::Fitted;
 use crate::hypothesis::Hypothesis;
 use crate::scan::{Projection, candidates, scan};
 use crate::term::Term;
-use crate::testing::template;
+use crate::testing::{template, whitened};
 use inference::Campaign;
 use inference::recording::Recording;
 use inference::simulate::{self, Beyond, Hardware, Truth};
@@ -119,7 +119,7 @@ impl Standard {
 
     /// The place of each kind that the campaign sees best.
     fn best_seen(&self) -> Vec<Term> {
-        let data = Data::from_campaign(&Campaign::of(&self.ring, &self.noisy).unwrap()).unwrap();
+        let data = whitened(&self.ring, &self.noisy);
         let pair = self.template.header.radial_loop_monitors.as_ref();
         let null = Fitted::from_guess(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
         let scanned = scan(&data, &null, &candidates(&data, pair)).unwrap();

@@ -305,11 +305,9 @@ mod tests {
     use core::f64::consts::TAU;
 
     use estimator::MonitorState;
-    use inference::Campaign;
     use inference::recording::Recording;
     use rand::rngs::StdRng;
     use rand::{RngExt, SeedableRng};
-    use rand_distr::{Distribution, StandardNormal};
     use twin::Hold;
 
     use super::*;
@@ -319,12 +317,8 @@ mod tests {
     use crate::noise::Noise;
     use crate::odds::correction_of_sort;
     use crate::period::Recurs;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, normal, template, whitened};
     use crate::verdict::Verdict;
-
-    fn normal(random: &mut StdRng) -> f64 {
-        StandardNormal.sample(random)
-    }
 
     /// The shapes of the machine of some vars, and a campaign of it with one of them [m] of some amplitudes in each frame.
     struct Case {
@@ -367,7 +361,7 @@ mod tests {
         }
 
         fn learnt(&self, recording: &Recording) -> Noise {
-            Data::from_campaign(&Campaign::of(&self.ring, recording).unwrap()).unwrap().noise
+            whitened(&self.ring, recording).noise
         }
     }
 

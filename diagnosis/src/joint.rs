@@ -182,7 +182,6 @@ impl Data {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
     use inference::recording::{Recording, at_energy};
     use twin::{Effect, Ring};
 
@@ -190,7 +189,7 @@ mod tests {
     use crate::hypothesis::Hypothesis;
     use crate::scan::signatures;
     use crate::term::Term;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, template, whitened};
     use crate::{Diagnosis, Verdict};
 
     /// Momentum of 1.5 GeV protons over that of 1 GeV.
@@ -221,7 +220,7 @@ mod tests {
 
     fn data_of(ring: &Ring, recording: &Recording) -> Data {
         let ring = at_energy(ring, recording.header.kinetic_energy);
-        Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap()
+        whitened(&ring, recording)
     }
 
     /// About the same machine chi-square and information are sums; a stray field counts by the rigidity, a magnet's error does not.

@@ -301,9 +301,10 @@ mod tests {
     use nalgebra::DVector;
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal, StudentT};
+    use rand_distr::{Distribution, StudentT};
 
     use super::*;
+    use crate::testing::normal;
 
     const FRAMES: usize = 346;
     const MONITORS: usize = 30;
@@ -316,10 +317,6 @@ mod tests {
             if frame.is_multiple_of(3) { f64::NAN } else { noise(&mut random) * scale(frame, b) }
         };
         DMatrix::from_fn(FRAMES, MONITORS, of)
-    }
-
-    fn normal(random: &mut StdRng) -> f64 {
-        StandardNormal.sample(random)
     }
 
     #[test]

@@ -31,15 +31,13 @@ pub fn lost_frames(own: &Data) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-
     use super::*;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     #[test]
     fn a_trip_and_a_lost_beam_are_told() {
         let (ring, recording) = template();
-        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let data = |recording: &_| whitened(&ring, recording);
         assert_eq!(lost_frames(&data(&recording)), None);
         let mut broken = recording.clone();
         // the orbit of another setting, and none

@@ -518,7 +518,7 @@ mod tests {
     use super::*;
     use crate::Diagnosis;
     use crate::data::Data;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, template, whitened};
     use crate::verdict::Verdict;
 
     /// What is learnt of a campaign, and what is true of it: scale, slow share, its time, walk, jitter, crate's share.
@@ -556,7 +556,7 @@ mod tests {
         for seed in 0..2 {
             for truth in kinds(|| Coloured::white(&ring, &recording, 100 + seed)) {
                 let made = truth.campaign(&ring, &recording, &[]);
-                let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+                let data = whitened(&ring, &made);
                 for (name, found, truth) in learnt(&data.noise, &truth, recording.header.noise[0]) {
                     println!("{seed} {name}: {:.3e} ± {:.1e}, true {truth:.3e}", found.value, found.sigma);
                     assert!((found.value - truth).abs() <= 3.0 * found.sigma + 1e-12, "{name}");
@@ -623,8 +623,7 @@ mod tests {
         let (ring, recording) = template();
         let (part, factor) = (150..220, 4.0_f64);
         let white = Coloured::white(&ring, &recording, 71);
-        let sound =
-            Data::from_campaign(&Campaign::of(&ring, &white.campaign(&ring, &recording, &[])).unwrap()).unwrap();
+        let sound = whitened(&ring, &white.campaign(&ring, &recording, &[]));
         let mut random = StdRng::seed_from_u64(72);
         let more = Normal::new(0.0, white.noise * (factor * factor - 1.0).sqrt()).unwrap();
         let in_part = |frame: usize, _| if part.contains(&frame) { more.sample(&mut random) } else { 0.0 };
@@ -656,7 +655,7 @@ mod tests {
             .for_each(|row| row.reading[jumping] = row.reading[jumping].map(|x| x + 8e-3));
         let value = made.rows[180].reading[stuck];
         made.rows[181..200].iter_mut().for_each(|row| row.reading[stuck] = value);
-        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = whitened(&ring, &made);
         assert_eq!(data.health()[jumping].state, MonitorState::Jumps);
         assert!((184..200).all(|frame| data.is_aside(frame, stuck)), "a value that repeats is no reading");
     }

@@ -138,9 +138,9 @@ fn explained(values: &DVector<f64>, columns: Vec<DVector<f64>>) -> f64 {
 mod tests {
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
+    use crate::testing::normal;
 
     const FRAMES: usize = 346;
 
@@ -148,9 +148,8 @@ mod tests {
     fn noise(seed: u64) -> (Vec<f64>, Vec<Range<usize>>) {
         let mut random = StdRng::seed_from_u64(seed);
         let runs = (0..FRAMES).step_by(3).map(|start| start..FRAMES.min(start + 3)).collect();
-        let white = |random: &mut StdRng| -> f64 { StandardNormal.sample(random) };
-        let mean: Vec<f64> = (0..=FRAMES / 3).map(|_| 5.0 * white(&mut random)).collect();
-        ((0..FRAMES).map(|frame| mean[frame / 3] + white(&mut random)).collect(), runs)
+        let mean: Vec<f64> = (0..=FRAMES / 3).map(|_| 5.0 * normal(&mut random)).collect();
+        ((0..FRAMES).map(|frame| mean[frame / 3] + normal(&mut random)).collect(), runs)
     }
 
     #[test]

@@ -180,21 +180,17 @@ mod tests {
 
     use super::*;
     use crate::hypothesis::Hypothesis;
-    use crate::testing::template;
-    use inference::simulate::{Hardware, Truth, campaign};
+    use crate::testing::{simulated, template, whitened};
     use twin::Effect;
 
     #[test]
     fn the_scan_peaks_where_the_gradient_is() {
-        let (ring, recording) = template();
-        let hardware = Hardware::shipped(&ring, &recording);
+        let ring = template().0;
         // the vars of its neighbours imitate a normal gradient: it has to be larger, and its place is less certain
         let cases = [(Thin::Normal, "SLOT_C6", 0.08, 12.0), (Thin::Skew, "SLOT_E3", 0.01, 4.0)];
         for (thin, place, amplitude, widest) in cases {
             let effect = Effect::at(thin.kind(), place, amplitude, &ring).unwrap();
-            let truth = Truth { vars: &[1.0; 48], effects: core::slice::from_ref(&effect), ..Truth::default() };
-            let made = campaign(&recording, &ring, &truth, &hardware, 7).unwrap();
-            let mut data = Data::from_campaign(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
+            let mut data = whitened(&ring, &simulated(&[1.0; 48], &[effect], &[], 7));
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
             let fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(48)).unwrap();
             let (machine, drives) = fitted.machine(&data, 0).unwrap();

@@ -49,15 +49,13 @@ fn longest(repeated: &[bool]) -> Option<Range<usize>> {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-
     use super::*;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     #[test]
     fn a_monitor_that_repeats_a_value_is_told_and_a_lost_beam_is_not_that() {
         let (ring, recording) = template();
-        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let data = |recording: &_| whitened(&ring, recording);
         assert!(stuck_monitors(&data(&recording)).is_empty());
         let mut broken = recording.clone();
         let value = broken.rows[100].reading[7];

@@ -609,12 +609,11 @@ pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
     use twin::Site;
 
     use super::*;
     use crate::discrepancy::Discrepancy;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     /// At 1.5 standard errors chance decides, and without a choice that predicts nothing does.
     #[test]
@@ -634,7 +633,7 @@ mod tests {
     #[test]
     fn an_effect_at_an_instrument_that_does_something_unknown_is_a_part_of_that() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let alternative = |cause: Cause, probability: f64| Alternative {
             probability,
             ..Alternative::unfitted(cause, 50.0, (-0.2, 0.01))

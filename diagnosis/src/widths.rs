@@ -249,8 +249,7 @@ fn information(covariance: &DMatrix<f64>, of: Range<usize>) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Coloured, template};
-    use inference::Campaign;
+    use crate::testing::{Coloured, template, whitened};
 
     /// Members that the recording shows in full are as wide as their rms; those that it does not show at all get no width.
     #[test]
@@ -289,8 +288,7 @@ mod tests {
             let power = if seed % 2 == 0 { 0.5 } else { 1.0 };
             made.vars.iter_mut().for_each(|var| *var = var.powf(power));
             let rms = (made.vars.iter().map(|var| var.ln().powi(2)).sum::<f64>() / made.vars.len() as f64).sqrt();
-            let data =
-                Data::from_campaign(&Campaign::of(&ring, &made.campaign(&ring, &recording, &[])).unwrap()).unwrap();
+            let data = whitened(&ring, &made.campaign(&ring, &recording, &[]));
             let first = Fitted::from_guess(&data, &Hypothesis::plain(), &DVector::zeros(data.units.len())).unwrap();
             let hypothesis = learnt(&data, &first);
             let fitted = Fitted::from_guess(&data, &hypothesis, &first.guess(&data, &hypothesis)).unwrap();
@@ -307,7 +305,7 @@ mod tests {
     #[test]
     fn families_hold_every_instrument_once() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let of = |name: &str| Family::all().into_iter().find(|family| family.name == name).unwrap().members(&data);
         assert_eq!(of("gains of monitors").len(), 33);
         let together = [of("gain of all horizontal monitors"), of("gain of all vertical monitors")];
@@ -324,7 +322,7 @@ mod tests {
     #[test]
     fn ordinary_imperfections_are_of_first_order() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let plain = Hypothesis::plain();
         let first = Fitted::from_guess(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
         let second = Fitted::from_guess(&data, &plain, &first.u).unwrap();

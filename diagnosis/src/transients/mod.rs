@@ -515,7 +515,7 @@ mod tests {
     use twin::{Cycle, Effect};
 
     use super::*;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, simulated, template};
 
     fn found(effects: &[&str], seed: u64, change: impl Fn(&mut Coloured)) -> (Ring, Vec<Transient>) {
         let (ring, recording) = template();
@@ -592,11 +592,8 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn all_correctors_that_settle_are_one_cause_and_their_first_frames_are_left_out() {
-        let (ring, recording) = template();
-        let hardware = inference::simulate::Hardware::shipped(&ring, &recording);
-        let truth = inference::simulate::Truth { vars: &[1.0; 48], beyond: &[&Settling(0.05)], ..Default::default() };
-        let made = inference::simulate::campaign(&recording, &ring, &truth, &hardware, 8).unwrap();
-        let Transients { found, campaign } = Transients::find(&ring, &made).unwrap();
+        let made = simulated(&[1.0; 48], &[], &[&Settling(0.05)], 8);
+        let Transients { found, campaign } = Transients::find(&template().0, &made).unwrap();
         assert_eq!(found.len(), 1);
         let Cause::Unmodelled(one) = &found[0].alternatives[0].cause else { panic!("{:?}", found[0].alternatives[0]) };
         let Location::FirstFrames { from, to } = one.at else { panic!("{:?}", one.at) };
