@@ -11,6 +11,7 @@ mod heldout;
 mod imperfections;
 mod lattice;
 mod limits;
+mod location;
 mod method;
 mod monitors;
 mod optics;

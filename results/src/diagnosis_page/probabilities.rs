@@ -3,6 +3,7 @@
 use diagnosis::{Alternative, Cause, Competition, Data, Diagnosis, Finding, capitalised};
 use report::{Axes, Figure, Ranked, Section};
 
+use super::location::short;
 use super::slope::name;
 
 /// Causes with a bar of their own.
@@ -82,7 +83,7 @@ fn label(data: &Data, one: &Alternative) -> String {
         Cause::Effect(term) => {
             format!("{} {}", term.kind.word().replace('_', " "), term.site.name(&data.ring)).trim_end().to_owned()
         }
-        Cause::Unmodelled(discrepancy) => discrepancy.at.short(data),
+        Cause::Unmodelled(discrepancy) => short(&discrepancy.at, data),
     }
 }
 
