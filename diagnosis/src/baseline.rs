@@ -26,7 +26,7 @@ pub struct Baseline {
     /// Standard deviation of the orbit at each element (x, y) [m].
     pub sigma: Vec<[f64; 2]>,
     /// Share of each monitor's own mean reading in the estimated orbit at its place [1].
-    share: Vec<f64>,
+    pub(super) share: Vec<f64>,
     /// Mean reading of each monitor less the response to the kicks [m]; none for a monitor without readings.
     read: Vec<Option<f64>>,
 }
@@ -64,12 +64,6 @@ impl Baseline {
         let Kriged { orbit, sigma, share, kick, .. } = Kriged::from_baselines(ring, &baselines, rms)?;
         let lengthened = lengthened(ring, &optics, kick);
         Ok((orbit, Self { rms, sensitivity, spurious, lengthened, sigma, share, read: baselines }))
-    }
-
-    /// The same where the orbit is known, whatever the monitors read.
-    #[cfg(test)]
-    pub fn known(self) -> Self {
-        Self { share: vec![0.0; self.share.len()], ..self }
     }
 
     /// The orbit at a monitor that misreads a position x by `m(x)` [m], given the one that was estimated as if it did not: as that one holds the share `w` of

@@ -42,8 +42,7 @@ use super::readmission::{JUMPS, left_aside, readmitted};
 use super::units::Units;
 use super::wiring::Miswired;
 use inference::recording::Recording;
-use inference::{Campaign, Excluded, Meter, Screened, Settings};
-use inference::{TUNE_CALIBRATION, chi_square};
+use inference::{Campaign, Excluded, Meter, Screened, Settings, TUNE_CALIBRATION, chi_square};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]

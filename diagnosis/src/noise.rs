@@ -29,8 +29,7 @@ use super::repeats::{Repeats, Run};
 use super::scale::{ALIKE, QUOTED, Scales};
 use super::slow_noise::{SHARE, Slow, steps};
 use super::transients::runs;
-use inference::Campaign;
-use inference::{Imperfection, Measure, POSITION};
+use inference::{Campaign, Imperfection, Measure, POSITION};
 
 /// What was learnt of the noise. A value is 0 (a scale 1) where there is no sign of it; its error is then the root mean square that the
 /// recording allows.

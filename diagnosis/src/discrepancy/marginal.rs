@@ -55,14 +55,8 @@ impl<'f> Linearised<'f> {
         Self { fitted, slope: fitted.free.whiten(&fitted.slope), asked: least.max(ASKED) }
     }
 
-    /// Projected pull and Gram matrix of some amplitudes.
-    fn project(&self, sums: &Sums) -> (DVector<f64>, DMatrix<f64>) {
-        let pull = &sums.pull - &sums.cross * &self.slope;
-        (pull, &sums.gram - gram(&sums.cross.transpose()))
-    }
-
     pub fn judge(&self, at: Location, sums: &Sums, sites: usize) -> Discrepancy {
-        let (pull, gram) = self.project(sums);
+        let (pull, gram) = (&sums.pull - &sums.cross * &self.slope, &sums.gram - gram(&sums.cross.transpose()));
         self.conclude(at, marginals(&pull, &gram), sites, &[sums])
     }
 
