@@ -204,11 +204,6 @@ impl Competition {
         self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()
     }
 
-    /// Probability of physics that the library does not hold and that looks like one of its effects.
-    pub fn imitating(&self) -> f64 {
-        imitating(self.library())
-    }
-
     /// Probability of physics that the library does not hold, `unknown` in the JSON.
     pub fn unknown(&self) -> f64 {
         self.unknown_seen() + self.too_small
@@ -217,7 +212,7 @@ impl Competition {
     /// The same without what is too small to be seen, which is no evidence of anything.
     pub(crate) fn unknown_seen(&self) -> f64 {
         let listed = self.alternatives.iter().filter(|a| !a.is_of_library());
-        self.imitating() + listed.map(|a| a.probability).sum::<f64>()
+        imitating(self.library()) + listed.map(|a| a.probability).sum::<f64>()
     }
 
     /// The exact fit with the most likely effect of the library.

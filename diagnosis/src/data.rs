@@ -411,17 +411,14 @@ impl Data {
     /// The same recordings where one monitor wanders in one of them, or all do in all.
     pub(crate) fn wandering(&self, one: Option<(usize, usize)>, walk: Measured) -> Self {
         let mut data = self.clone();
-        match one {
-            Some((campaign, monitor)) => {
-                let changed = data.campaign_mut(campaign);
-                changed.noise.wandering.push((monitor, walk));
-                changed.prepare();
+        for campaign in 0..data.count() {
+            let own = data.campaign_mut(campaign);
+            match one {
+                Some((wandering, monitor)) if wandering == campaign => own.noise.wandering.push((monitor, walk)),
+                Some(_) => continue,
+                None => own.noise.slow.walk = walk,
             }
-            None => (0..data.count()).for_each(|campaign| {
-                let changed = data.campaign_mut(campaign);
-                changed.noise.slow.walk = walk;
-                changed.prepare();
-            }),
+            own.prepare();
         }
         data
     }
