@@ -84,26 +84,17 @@ impl Alternative {
     pub(super) fn from_candidate(candidate: &Candidate) -> Self {
         let scale = candidate.term.kind.prior_scale();
         let sigma = scale.map_or(0.0, |scale| scale / (1.0 + candidate.power).sqrt());
-        Self {
-            amplitude: (candidate.amplitude * scale.unwrap_or(1.0), sigma),
-            cause: Cause::Effect(candidate.term),
-            log_gain: candidate.log_bayes,
-            probability: 0.0,
-            adapting: &candidate.adapting * candidate.amplitude,
-            fitted: None,
-        }
+        let amplitude = (candidate.amplitude * scale.unwrap_or(1.0), sigma);
+        let adapting = &candidate.adapting * candidate.amplitude;
+        Self { adapting, ..Self::unfitted(Cause::Effect(candidate.term), candidate.log_bayes, amplitude) }
     }
 
     /// One of the terms of a fit, compared with the fit without it.
     pub(super) fn exact(data: &Data, without: &Fitted, fitted: Fitted, term: usize) -> Self {
-        Self {
-            cause: Cause::Effect(fitted.hypothesis.terms[term]),
-            log_gain: fitted.log_evidence - without.log_evidence,
-            probability: 0.0,
-            amplitude: fitted.amplitude(data, term),
-            adapting: DVector::zeros(0),
-            fitted: Some(fitted),
-        }
+        let cause = Cause::Effect(fitted.hypothesis.terms[term]);
+        let log_gain = fitted.log_evidence - without.log_evidence;
+        let amplitude = fitted.amplitude(data, term);
+        Self { fitted: Some(fitted), ..Self::unfitted(cause, log_gain, amplitude) }
     }
 
     /// A cause without a fit of its own, its probability still open.
@@ -213,11 +204,6 @@ impl Competition {
         self.alternatives.iter().filter(|a| a.is_of_library()).map(|a| a.probability).sum()
     }
 
-    /// Probability of physics that the library does not hold and that looks like one of its effects.
-    pub fn imitating(&self) -> f64 {
-        imitating(self.library())
-    }
-
     /// Probability of physics that the library does not hold, `unknown` in the JSON.
     pub fn unknown(&self) -> f64 {
         self.unknown_seen() + self.too_small
@@ -226,7 +212,7 @@ impl Competition {
     /// The same without what is too small to be seen, which is no evidence of anything.
     pub(crate) fn unknown_seen(&self) -> f64 {
         let listed = self.alternatives.iter().filter(|a| !a.is_of_library());
-        self.imitating() + listed.map(|a| a.probability).sum::<f64>()
+        imitating(self.library()) + listed.map(|a| a.probability).sum::<f64>()
     }
 
     /// The exact fit with the most likely effect of the library.

@@ -8,9 +8,8 @@ use nalgebra::{DMatrix, DVector};
 
 use super::alternatives::{Cause, Competition};
 use super::discrepancy::Discrepancy;
-use super::error::FitError;
 use super::family::Family;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 #[cfg(doc)]
 use super::hypothesis::Hypothesis;
 use super::odds::DECISIVE;
@@ -48,9 +47,6 @@ impl Vars {
     }
 
     /// The same with room for what the recording cannot show ([`Hypothesis::unseen`], [`Family::hidden`]), to first order.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub(crate) fn widened(self, found: &Found) -> Result<Self, FitError> {
         let (data, best) = (&found.data, &found.best);
         let (step, wide) = best.widened(data, &best.hypothesis.unseen(data), &Family::hidden(data))?;
@@ -96,12 +92,9 @@ impl Vars {
 mod tests {
     use twin::{Effect, EffectKind};
 
-    use inference::Campaign;
-
     use super::*;
-    use crate::data::Data;
     use crate::hypothesis::Hypothesis;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, template, whitened};
     use crate::{Diagnosis, Verdict};
 
     /// To first order about the fit against a fit with all that: the vars move by little of their error bars, which agree.
@@ -110,7 +103,7 @@ mod tests {
     fn room_for_what_is_hidden_is_that_of_a_fit_with_it() {
         let (ring, recording) = template();
         let made = Coloured::white(&ring, &recording, 71).campaign(&ring, &recording, &[]);
-        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = whitened(&ring, &made);
         let plain = Hypothesis::plain();
         let fitted = Fitted::from_guess(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
         let (wide, hidden) = (plain.unseen(&data), Family::hidden(&data));

@@ -26,7 +26,7 @@ pub struct Baseline {
     /// Standard deviation of the orbit at each element (x, y) [m].
     pub sigma: Vec<[f64; 2]>,
     /// Share of each monitor's own mean reading in the estimated orbit at its place [1].
-    share: Vec<f64>,
+    pub(super) share: Vec<f64>,
     /// Mean reading of each monitor less the response to the kicks [m]; none for a monitor without readings.
     read: Vec<Option<f64>>,
 }
@@ -48,9 +48,6 @@ const FLATTEST: f64 = 0.2;
 impl Baseline {
     /// The orbit (x, y) at every element [m] and its properties, from the readings less the response to the kicks (rows frames, columns
     /// monitors) and the recorded tunes. `per_rms`: change per RF offset beyond the design dispersion, per rms of the baselines.
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the ring has no orbit.
     pub fn from_readings(
         ring: &Ring,
         readings: &DMatrix<f64>,
@@ -69,12 +66,6 @@ impl Baseline {
         Ok((orbit, Self { rms, sensitivity, spurious, lengthened, sigma, share, read: baselines }))
     }
 
-    /// The same where the orbit is known, whatever the monitors read.
-    #[cfg(test)]
-    pub fn known(self) -> Self {
-        Self { share: vec![0.0; self.share.len()], ..self }
-    }
-
     /// The orbit at a monitor that misreads a position x by `m(x)` [m], given the one that was estimated as if it did not: as that one holds the share `w` of
     /// the monitor's own reading, the solution of `x + w m(x) = estimated`, by Newton steps, which end where the reading hardly grows with the position: what
     /// there is no longer told by it.
@@ -88,9 +79,6 @@ impl Baseline {
 
     /// Displace a machine's quadrupoles so that its orbit without kicks is the estimated one; what it has by itself, off momentum, is not
     /// theirs.
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the machine has no orbit.
     pub(crate) fn displace(&self, machine: &mut Machine) -> Result<(), OrbitError> {
         let own = machine.orbit()?;
         let ring = machine.ring_mut();
@@ -217,10 +205,10 @@ impl Kriged {
 mod tests {
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal};
     use twin::ClosedOrbit;
 
     use super::*;
+    use crate::testing::normal;
 
     /// The orbit at a monitor moves by that share of what its own reading does.
     #[test]
@@ -263,7 +251,7 @@ mod tests {
             let (mut displaced, mut random) = (ring.clone(), StdRng::seed_from_u64(seed));
             let mut longer = 0.0;
             for (quadrupole, k1l) in ring.quadrupoles.iter().zip(ring.integrated_gradients()) {
-                let draw: f64 = StandardNormal.sample(&mut random);
+                let draw = normal(&mut random);
                 displaced.elements[quadrupole.element].misalignment.dx = kick * draw / k1l;
                 longer += kick * draw * optics.dispersion(&optics.observe(quadrupole.element, Plane::X));
             }

@@ -13,7 +13,7 @@ use rand::{RngExt, SeedableRng};
 use rand_distr::StandardNormal;
 
 use super::choice::Choice;
-use super::error::FitError;
+use super::fit::FitError;
 use super::scan::SignatureScore;
 
 /// Recordings drawn: a probability of 1 % is then known to a half.
@@ -23,9 +23,6 @@ const SEED: u64 = 1;
 const ROUNDING: f64 = 1e-9;
 
 /// Probability that the best of the candidates is at least as much better than its penalty as in this recording, were none of them there.
-///
-/// # Errors
-/// [`FitError::Degenerate`].
 pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
     let scores = || choice.scores.iter().copied();
     let best =
@@ -48,25 +45,25 @@ pub fn of_search(choice: &Choice) -> Result<f64, FitError> {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-
     use super::*;
-    use crate::data::Data;
-    use crate::heldout::{gain_of_choice, reduced};
+    use crate::heldout::{gain_of_choice, lessened};
     use crate::odds::corrections;
     use crate::scan::candidates;
     use crate::search::{Found, Search};
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, template, whitened};
     use twin::{Effect, EffectKind};
 
     /// The probability, and the held-out gain of the choice, of a campaign with some effects.
     fn tested(effects: &[Effect], seed: u64) -> (f64, f64) {
         let (ring, recording) = template();
         let made = Coloured::white(&ring, &recording, seed).campaign(&ring, &recording, effects);
-        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = whitened(&ring, &made);
         let terms = candidates(&data, None);
         let Found { data, null, best, .. } = Search::new(terms.clone()).run(data).unwrap();
-        let fitted = if best.hypothesis.terms.is_empty() { null } else { reduced(&data, &best, 0).unwrap() };
+        let fitted = match best.hypothesis.terms.is_empty() {
+            true => null,
+            false => lessened(&data, &best, best.hypothesis.without(0)).unwrap(),
+        };
         let penalty = corrections(&terms);
         let choice = Choice::from_terms(&data, &fitted, &terms, &penalty).unwrap();
         (of_search(&choice).unwrap(), gain_of_choice(&choice).unwrap())

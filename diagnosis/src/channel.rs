@@ -6,7 +6,7 @@
 //!
 //! `T = (1 - Q (1 - (1 + D^2)^(-1/2)) Q^T) A`, so that `T^T T = (C + U U^T)^-1`.
 
-use nalgebra::{DMatrix, DMatrixViewMut, DVector, DVectorViewMut};
+use nalgebra::{DMatrix, DMatrixViewMut, DVector};
 
 use super::levels::Levels;
 use super::memory::{Filter, Memory};
@@ -112,12 +112,6 @@ impl Channel {
         }
     }
 
-    /// The same of one column.
-    pub(crate) fn whiten_column(&self, column: &mut DVectorViewMut<f64>) {
-        let rows = column.len();
-        self.whiten_mut(DMatrixViewMut::from_slice(column.as_mut_slice(), rows, 1));
-    }
-
     /// The part of `T^T T` that common terms take, `common common^T` [rows][factors], for white noise: `T^T T = diag(n) - common common^T`.
     pub fn taken(&self) -> DMatrix<f64> {
         let mut taken = self.basis.clone();
@@ -173,9 +167,6 @@ mod tests {
             let t = channel.whiten(DMatrix::identity(4, 4) / sigma);
             assert!((t.tr_mul(&t) * &covariance - DMatrix::identity(4, 4)).amax() < 1e-12, "rounding");
             assert!((channel.log_det - covariance.determinant().ln()).abs() < 1e-12, "rounding");
-            let mut one = DVector::from_element(4, 1.0 / sigma);
-            channel.whiten_column(&mut one.as_view_mut());
-            assert!((one - t.column_sum()).amax() < 1e-12, "rounding");
             if memory == none {
                 let taken = channel.taken();
                 let apart = DMatrix::from_diagonal(&channel.readings()) - &taken * taken.transpose();

@@ -4,9 +4,8 @@
 use nalgebra::DMatrix;
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
-use super::scan::{Projection, Scored, SignatureScore, signatures};
+use super::fit::{FitError, Fitted};
+use super::scan::{Projection, SignatureScore, signatures};
 use super::term::Term;
 
 /// Candidates beside a fit, to first order.
@@ -31,9 +30,6 @@ const BEYOND_CHANCE: f64 = 100.0;
 
 impl<'d> Choice<'d> {
     /// Of some terms and their penalties. Exchanged instruments that neither the recording nor chance can choose are left out.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub fn from_terms(data: &'d Data, without: &'d Fitted, terms: &[Term], penalty: &[f64]) -> Result<Self, FitError> {
         let columns = signatures(data, without, terms)?;
         let projection = Projection::from_fit(without);
@@ -44,7 +40,7 @@ impl<'d> Choice<'d> {
         };
         let open: Vec<usize> = (0..terms.len()).filter(is_open).collect();
         let columns = columns.select_columns(&open);
-        let Scored { scores, taken } = projection.score(&columns);
+        let (scores, taken) = projection.score(&columns);
         let left = &columns - &without.jacobian * taken;
         let (terms, penalty) = open.iter().map(|&i| (terms[i], penalty[i])).unzip();
         Ok(Self { data: without.data(data), without, terms, penalty, columns, left, scores })
@@ -56,6 +52,6 @@ impl<'d> Choice<'d> {
         scores: impl Iterator<Item = SignatureScore> + 'c,
     ) -> impl Iterator<Item = f64> + 'c {
         let all = scores.zip(&self.terms).zip(&self.penalty);
-        all.map(|((score, term), penalty)| score.log_bayes(term.kind.is_switch()) - penalty)
+        all.map(|((score, term), penalty)| score.judged(term.kind.is_switch()).1 - penalty)
     }
 }

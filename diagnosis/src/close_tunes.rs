@@ -28,9 +28,6 @@ const APART: f64 = 3.0;
 
 impl CloseTunes {
     /// Of a machine on its orbit, and tunes as recorded, rows frames; none where they are far enough apart, or not recorded.
-    ///
-    /// # Errors
-    /// [`OrbitError`] if the machine keeps no beam.
     pub fn find(machine: &Machine, recorded: &DMatrix<f64>) -> Result<Option<Self>, OrbitError> {
         let distances = recorded.row_iter().map(|tunes| tunes[0] - tunes[1]).filter(|distance| distance.is_finite());
         let distances: Vec<f64> = distances.map(|distance| (distance - distance.round()).abs()).collect();
@@ -60,17 +57,15 @@ impl fmt::Display for CloseTunes {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
     use twin::{Effect, Rf};
 
     use super::*;
-    use crate::data::Data;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     #[test]
     fn tunes_that_coupling_mixes_are_left_out_and_told() {
         let (ring, mut recording) = template();
-        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
+        let data = |recording: &_| whitened(&ring, recording);
         let apart = data(&recording);
         assert!(apart.close_tunes.is_none() && apart.tune_noise(0).is_some());
         // as a meter reads two modes next to each other

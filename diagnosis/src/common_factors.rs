@@ -1,6 +1,6 @@
 //! What the readings of a pool tell by their differences of the terms that they have in common.
 //!
-//! CommonFactors a pool the machine is the same but for the supplies, which the baseline follows by unknown factors `c`, standard normal in their
+//! In a pool the machine is the same but for the supplies, which the baseline follows by unknown factors `c`, standard normal in their
 //! prior. With `w` the readings less the mean of their pool, `W` the terms less theirs, both over the noise,
 //!
 //! `V = (1 + W^T W)^-1`, `m = V W^T w`
@@ -10,28 +10,18 @@
 
 use nalgebra::{DMatrix, DVector};
 
-/// Factors of the common terms, as the differences within pools tell them.
-#[derive(Debug, Clone)]
-pub struct CommonFactors {
-    /// Their mean.
-    pub mean: DVector<f64>,
-    /// Root of their covariance: its product with its transpose.
-    pub root: DMatrix<f64>,
-}
-
-impl CommonFactors {
-    /// From differences of readings and of their terms [readings][factors], both over the noise.
-    pub fn from_differences(readings: &DVector<f64>, terms: &DMatrix<f64>) -> Self {
-        let factors = terms.ncols();
-        let normal = DMatrix::identity(factors, factors) + terms.tr_mul(terms);
-        let unknown = || Self { mean: DVector::zeros(factors), root: DMatrix::identity(factors, factors) };
-        let Some(factor) = normal.cholesky() else { return unknown() };
-        // (L L^T)^-1 = L^-T L^-1
-        let Some(root) = factor.l().transpose().solve_upper_triangular(&DMatrix::identity(factors, factors)) else {
-            return unknown();
-        };
-        Self { mean: factor.solve(&terms.tr_mul(readings)), root }
-    }
+/// Mean of the factors of the common terms, and the root of their covariance, its product with its transpose, from differences of readings and of their
+/// terms [readings][factors], both over the noise.
+pub fn common_factors(readings: &DVector<f64>, terms: &DMatrix<f64>) -> (DVector<f64>, DMatrix<f64>) {
+    let factors = terms.ncols();
+    let normal = DMatrix::identity(factors, factors) + terms.tr_mul(terms);
+    let unknown = || (DVector::zeros(factors), DMatrix::identity(factors, factors));
+    let Some(factor) = normal.cholesky() else { return unknown() };
+    // (L L^T)^-1 = L^-T L^-1
+    let Some(root) = factor.l().transpose().solve_upper_triangular(&DMatrix::identity(factors, factors)) else {
+        return unknown();
+    };
+    (factor.solve(&terms.tr_mul(readings)), root)
 }
 
 #[cfg(test)]
@@ -59,11 +49,11 @@ mod tests {
                 row -= &mean_terms;
             });
         }
-        let within = CommonFactors::from_differences(&off, &off_terms);
-        let left = &means.0 - &means.1 * &within.mean;
-        let terms = &means.1 * &within.root;
+        let (mean, root) = common_factors(&off, &off_terms);
+        let left = &means.0 - &means.1 * &mean;
+        let terms = &means.1 * &root;
         let step = (DMatrix::identity(2, 2) + terms.tr_mul(&terms)).cholesky().unwrap().solve(&terms.tr_mul(&left));
-        let found = &within.mean + &within.root * step;
+        let found = &mean + &root * step;
         assert!((found - whole).amax() < 1e-12, "rounding");
     }
 }

@@ -28,9 +28,10 @@ use twin::{
 use super::baseline::Baseline;
 use super::channel::Channel;
 use super::close_tunes::CloseTunes;
-use super::common_factors::CommonFactors;
-use super::error::FitError;
+use super::columns::beside;
+use super::common_factors::common_factors;
 use super::exact_orbits::Exact;
+use super::fit::FitError;
 use super::frame_pattern::Shape;
 use super::levels::Levels;
 use super::memory::{Filter, Memory};
@@ -41,8 +42,7 @@ use super::readmission::{JUMPS, left_aside, readmitted};
 use super::units::Units;
 use super::wiring::Miswired;
 use inference::recording::Recording;
-use inference::{Campaign, Excluded, Meter, Screened, Settings};
-use inference::{TUNE_CALIBRATION, chi_square};
+use inference::{Campaign, Excluded, Meter, Screened, Settings, TUNE_CALIBRATION, chi_square};
 
 /// A recording, whitened.
 #[derive(Debug, Clone)]
@@ -78,13 +78,13 @@ pub struct Data {
     pub pools: Pools,
     /// Frame by frame.
     frames: Frames,
-    /// Noise of a reading of each monitor by the recording's header [B] [m].
-    pub expected_noise: Vec<f64>,
+    /// Noise of a reading by the recording's header, mean over the monitors [m].
+    pub mean_noise: f64,
     /// The noise as learnt.
     pub noise: Noise,
     /// Of each monitor, then of the two tunes.
-    channels: Vec<Channel>,
-    mixing: Mixing,
+    pub(super) channels: Vec<Channel>,
+    pub(super) mixing: Mixing,
     /// A constant taken off each monitor's readings before those of a pool are mixed, about their mean; 0 where none are [B] [m].
     centre: DVector<f64>,
     /// What the header states to be held.
@@ -285,12 +285,13 @@ impl Data {
             let jumps = !noise.levels.is_constant() && left_aside(&screened.excluded, b) > JUMPS;
             screened.health[b].state = if jumps { MonitorState::Jumps } else { MonitorState::Ok };
         }
-        let sharing: Vec<usize> = (0..recorded.ncols()).filter(|&b| noise.modes.factors.row(b).amax() > 0.0).collect();
+        let sharing: Vec<usize> = (0..recorded.ncols()).filter(|&b| noise.modes.row(b).amax() > 0.0).collect();
         let excluded = &screened.excluded;
         let has_same_monitors = |i: usize| sharing.iter().all(|&b| excluded.counts(i, b) == excluded.counts(i - 1, b));
         let is_like_before = |i: usize| noise.levels.at(i) == noise.levels.at(i - 1) && has_same_monitors(i);
         let pools = Pools::from_settings(&campaign.settings.repeatable, is_like_before);
         let of_pools = pools.drives(&drives);
+        let header_noise = &recording.header.noise;
         let ramped = recording.header.ramp.at(campaign.times.known[0], supplies.len());
         let mut data = Self {
             name: recording.name.clone(),
@@ -305,7 +306,7 @@ impl Data {
             baseline,
             tune_shift_of_orbit: [0.0; 2],
             close_tunes,
-            expected_noise: recording.header.noise.clone(),
+            mean_noise: header_noise.iter().sum::<f64>() / header_noise.len().max(1) as f64,
             centre: DVector::zeros(recorded.ncols() + 2),
             noise,
             channels: Vec::new(),
@@ -318,8 +319,8 @@ impl Data {
             pools,
             frames: Frames {
                 drives,
-                recorded: beside(recorded, &recorded_tunes),
-                readings: beside(recorded, &recorded_tunes),
+                recorded: beside(recorded.clone(), &recorded_tunes),
+                readings: beside(recorded.clone(), &recorded_tunes),
                 fluctuation: campaign.fluctuation.clone(),
                 tune_noise: [None; 2],
             },
@@ -341,7 +342,7 @@ impl Data {
     pub(crate) fn linearise_about(&mut self, machine: &Machine, orbit: &[[f64; 2]]) -> Result<f64, EffectError> {
         let frames = Drives { orbit: orbit.to_vec(), ..self.frames.drives.clone() };
         let means = Drives { orbit: orbit.to_vec(), ..self.drives.clone() };
-        let within = machine.readings(&frames)?.0 - self.pools.by_frame(&machine.readings(&means)?.0);
+        let within = machine.readings(&frames)?.0 - machine.readings(&means)?.0.select_rows(&self.pools.of_frame);
         let off: Vec<[f64; 2]> =
             orbit.iter().zip(&self.drives.orbit).map(|(own, one)| [own[0] - one[0], own[1] - one[1]]).collect();
         let displaced = Displaced::from_machine(machine, &self.baseline, &off)?;
@@ -391,7 +392,7 @@ impl Data {
     /// The same recording with a known signal taken out of its readings and tunes, rows frames.
     pub fn less(&self, readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> Self {
         let mut data = self.clone();
-        let signal = beside(readings, tunes);
+        let signal = beside(readings.clone(), tunes);
         data.frames.readings -= &signal;
         data.frames.recorded -= signal;
         data.prepare();
@@ -407,21 +408,18 @@ impl Data {
         data
     }
 
-    /// The same recordings where all monitors wander.
-    pub fn wandering(&self, walk: Measured) -> Self {
+    /// The same recordings where one monitor wanders in one of them, or all do in all.
+    pub(crate) fn wandering(&self, one: Option<(usize, usize)>, walk: Measured) -> Self {
         let mut data = self.clone();
-        data.noise.slow.walk = walk;
-        data.prepare();
-        data.others.iter_mut().for_each(|other| *other = other.wandering(walk));
-        data
-    }
-
-    /// The same recordings where one monitor wanders in one of them.
-    pub(crate) fn with_wandering(&self, campaign: usize, monitor: usize, walk: Measured) -> Self {
-        let mut data = self.clone();
-        let changed = data.campaign_mut(campaign);
-        changed.noise.wandering.push((monitor, walk));
-        changed.prepare();
+        for campaign in 0..data.count() {
+            let own = data.campaign_mut(campaign);
+            match one {
+                Some((wandering, monitor)) if wandering == campaign => own.noise.wandering.push((monitor, walk)),
+                Some(_) => continue,
+                None => own.noise.slow.walk = walk,
+            }
+            own.prepare();
+        }
         data
     }
 
@@ -504,24 +502,20 @@ impl Data {
         let readings = DVector::from_iterator(each.len(), readings).component_div(&noise);
         let terms =
             DMatrix::from_fn(each.len(), all.ncols(), |i, k| (all[(each[i].1, k)] - means[(each[i].0, k)]) / noise[i]);
-        let within = CommonFactors::from_differences(&readings, &terms);
-        let told = &means * within.mean;
+        let (factors, root) = common_factors(&readings, &terms);
+        let told = &means * factors;
         rows.iter().zip(&told).for_each(|(&pool, told)| self.readings[(pool, b)] -= told);
-        self.drifting_with(b, rows, &self.drives, means * within.root)
+        self.drifting_with(b, rows, &self.drives, means * root)
     }
 
     /// With those of the RF frequency and the drift, at some rows of the drives.
     fn drifting_with(&self, b: usize, rows: &[usize], drives: &Drives, shared: DMatrix<f64>) -> DMatrix<f64> {
         let (plane, drift) = (usize::from(b >= self.ring.horizontal_monitors()), self.drift);
         let rf = DVector::from_iterator(rows.len(), rows.iter().map(|&i| drives.rf_offset[i]));
-        let at = shared.ncols();
-        let mut shared = shared.insert_column(at, 0.0);
-        shared.set_column(at, &(&rf * self.baseline.spurious[plane]));
+        let mut shared = beside(shared, &(&rf * self.baseline.spurious[plane]));
         let lengthened = rf.map(|offset| if offset == 0.0 { 0.0 } else { self.baseline.lengthened[b] });
         if lengthened.amax() > 0.0 {
-            let at = shared.ncols();
-            shared = shared.insert_column(at, 0.0);
-            shared.set_column(at, &lengthened);
+            shared = beside(shared, &lengthened);
         }
         if drift == 0.0 {
             return shared;
@@ -531,11 +525,7 @@ impl Data {
             let relative = (drift * self.baseline.sensitivity[plane]).powi(power) * self.baseline.rms[plane];
             DVector::from_iterator(rows.len(), rows.iter().map(|&i| drives.time[i].powi(power) * relative))
         };
-        let at = shared.ncols();
-        let mut shared = shared.insert_columns(at, 2, 0.0);
-        shared.set_column(at, &time(1));
-        shared.set_column(at + 1, &time(2));
-        shared
+        beside(beside(shared, &time(1)), &time(2))
     }
 
     fn check(&self, recording: &Recording) -> Result<(), DataError> {
@@ -612,9 +602,6 @@ impl Data {
     }
 
     /// Several signatures, whitened, one a column; columns of none stay 0. All columns of a channel at once are several times as fast as one by one.
-    ///
-    /// # Errors
-    /// The first among the signatures.
     pub(crate) fn signatures<E>(
         &self,
         mut into: DMatrixViewMut<f64>,
@@ -638,12 +625,10 @@ impl Data {
 
     /// Numbers of the channels, one for each pool, whitened: channel by channel.
     fn whiten(&self, value: impl Fn(usize, usize) -> f64) -> DVector<f64> {
-        let mut all = DVector::zeros(self.size());
+        let mut all = DMatrix::zeros(self.size(), 1);
         self.stack(&mut all.column_mut(0), value);
-        for (channel, rows) in self.channels.iter().zip(self.rows_of_channels()) {
-            channel.whiten_column(&mut all.rows_range_mut(rows));
-        }
-        all
+        self.whiten_stacked(all.as_view_mut());
+        all.column(0).into_owned()
     }
 
     /// Numbers of the channels over the noise of each, channel by channel, without the noise in common.
@@ -675,19 +660,13 @@ impl Data {
         if self.mixing.is_none() {
             return back;
         }
-        let monitors = self.monitors();
-        let starts: Vec<usize> = (0..monitors).map(|b| self.start(b)).collect();
-        let places = || {
-            let places_of_channel = |(b, channel): (usize, &Channel)| {
-                channel.rows.iter().enumerate().map(move |(i, &pool)| (i, pool, b)).collect::<Vec<_>>()
-            };
-            self.channels[..monitors].iter().enumerate().flat_map(places_of_channel)
-        };
+        // the monitors' are the first
+        let places: Vec<(usize, usize)> = self.places().into_iter().filter(|(_, c)| *c < self.monitors()).collect();
         for mut column in back.column_iter_mut() {
-            let mut values = DMatrix::zeros(self.pools.count, monitors);
-            places().for_each(|(i, frame, b)| values[(frame, b)] = column[starts[b] + i]);
+            let mut values = DMatrix::zeros(self.pools.count, self.monitors());
+            places.iter().zip(column.iter()).for_each(|(place, number)| values[*place] = *number);
             self.mixing.apply(&mut values);
-            places().for_each(|(i, frame, b)| column[starts[b] + i] = values[(frame, b)]);
+            places.iter().zip(column.iter_mut()).for_each(|(place, number)| *number = values[*place]);
         }
         back
     }
@@ -715,11 +694,6 @@ impl Data {
     /// First of a channel's whitened numbers.
     pub fn start(&self, c: usize) -> usize {
         self.channels[..c].iter().map(|channel| channel.rows.len()).sum()
-    }
-
-    /// A monitor's readings, whitened, or after the last of them a tune's.
-    pub(super) fn channels(&self) -> &[Channel] {
-        &self.channels
     }
 
     /// Sum of squares of measured less predicted readings, frame by frame, over the noise as learnt, about all that a monitor's readings have in
@@ -837,19 +811,9 @@ impl Data {
         }
     }
 
-    /// Noise of a reading by the recording's header, mean over the monitors [m].
-    pub fn mean_noise(&self) -> f64 {
-        self.expected_noise.iter().sum::<f64>() / self.expected_noise.len().max(1) as f64
-    }
-
     /// True if a monitor's noise remembers the frames before.
     pub(crate) fn remembers(&self, b: usize) -> bool {
         !self.noise.memory(b).is_none()
-    }
-
-    /// `ln` of the determinant of what monitors have in common in some pools, in units of their own noise.
-    pub(crate) fn mixed_log_det(&self, pools: &[usize]) -> f64 {
-        pools.iter().map(|&pool| self.mixing.log_det_of(pool)).sum()
     }
 
     /// Noise of one reading of the tune meter [1], if there are enough readings.
@@ -861,14 +825,6 @@ impl Data {
     pub fn health(&self) -> &[Health] {
         &self.screened.health
     }
-}
-
-/// Readings of monitors and, after them, tunes.
-fn beside(readings: &DMatrix<f64>, tunes: &DMatrix<f64>) -> DMatrix<f64> {
-    let monitors = readings.ncols();
-    let mut all = readings.clone().insert_columns(monitors, 2, 0.0);
-    all.columns_mut(monitors, 2).copy_from(tunes);
-    all
 }
 
 /// The noise, learnt from the readings about the machine that the screening ends with, or about the design where that keeps no beam; and which

@@ -5,12 +5,12 @@ use twin::{Effect, Ring};
 
 use super::average::Vars;
 use super::data::{Data, DataError};
-use super::error::FitError;
 use super::experiment::Proposal;
+use super::fit::FitError;
 use super::heldout::{self, Score};
 use super::hypothesis::in_order;
 use super::out_of_range::OutOfRange;
-use super::readback::Contradiction;
+use super::readback::contradictions;
 use super::scan;
 use super::search::{Found, Search};
 use super::term::Term;
@@ -25,8 +25,6 @@ use inference::Imperfection;
 pub struct Diagnosis {
     /// All that was found, with its fits.
     pub found: Found,
-    /// Read-backs of correctors that contradict their settings.
-    pub contradictions: Vec<Contradiction>,
     /// What passes within settings, which is not in the data of `found`.
     pub transients: Vec<Transient>,
     /// The verdict.
@@ -77,9 +75,6 @@ impl Diagnosis {
                 return Err(DataError::Miswired { recording: recording.name.clone(), wiring });
             }
         }
-        let names = ring.corrector_names();
-        let of_each = recordings.iter().flat_map(|recording| Contradiction::all(recording, &names));
-        let contradictions: Vec<Contradiction> = of_each.collect();
         progress("what passes within settings");
         let (mut transients, mut joined) = (Vec::new(), Vec::new());
         for (index, recording) in recordings.iter().enumerate() {
@@ -95,7 +90,11 @@ impl Diagnosis {
         let data = &found.data;
         progress("held-out frames");
         let blocks = heldout::by_pool(data);
-        let bare = if found.has_more() { heldout::bare(data, &found.best)? } else { found.null.clone() };
+        let (best, all) = (&found.best, &found.best.hypothesis);
+        let bare = match found.has_more() {
+            true => heldout::without_terms(data, best, &all.terms, &all.without_element())?,
+            false => found.null.clone(),
+        };
         let before = Score::from_blocks(data, &bare, &blocks)?;
         let after = if found.has_more() { Score::from_blocks(data, &found.best, &blocks)? } else { before.clone() };
         let tests = verdict::tests(data, &found, &candidates, (&bare, &before), &after, &blocks)?;
@@ -118,10 +117,15 @@ impl Diagnosis {
         let (vars_before, vars_after) = (Vars::from_fit(&found.null), Vars::averaged(&found).widened(&found)?);
         // a poor fit says nothing of single vars
         let beyond = if found.best.is_poor() { Vec::new() } else { OutOfRange::all(&data.ring, &vars_after) };
-        let sentence = verdict::sentence(data, &found, verdict, &findings, &contradictions, &beyond);
+        let names = ring.corrector_names();
+        let contradicted = |recording: &&Recording| {
+            let said = contradictions(recording, &names).into_iter();
+            said.map(|said| verdict::in_recording(data, &recording.name, said)).collect::<Vec<_>>()
+        };
+        let contradicted = recordings.iter().flat_map(contradicted).collect();
+        let sentence = verdict::sentence(data, &found, verdict, &findings, contradicted, &beyond);
         Ok(Self {
             found,
-            contradictions,
             transients,
             verdict,
             sentence,

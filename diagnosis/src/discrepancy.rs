@@ -23,8 +23,7 @@ use twin::{Plane, Signature, Signatures};
 
 use super::data::Data;
 use super::element::{Element, Form, Linear};
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::location::Location;
 pub use gradient::steering;
 use gradient::{Changing, Runs, Where};
@@ -73,7 +72,7 @@ fn scan_of(all: &Data, campaign: usize, fitted: &Fitted, least: f64) -> Result<V
         return Ok(Vec::new());
     }
     let (machine, drives) = fitted.machine_on_orbit(all, campaign)?;
-    let predicted = fitted.predicted_in(all, campaign)?;
+    let predicted = fitted.predicted(all, campaign)?;
     let signatures = Signatures::of(&machine, &drives)?;
     let mut found = Vec::new();
     for &b in &active {
@@ -213,14 +212,13 @@ fn patterned(data: &Data, sums: &[Sums], monitors: &[usize], setting: &DVector<f
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-    use inference::simulate::{self, Beyond, Hardware};
+    use inference::simulate;
     use nalgebra::MatrixXx2;
     use validation::{Unmodelled, UnmodelledKind};
 
     use super::*;
     use crate::hypothesis::Hypothesis;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, simulated, template, whitened};
     use crate::{Diagnosis, Verdict};
 
     fn seen_of(data: &Data, fitted: &Fitted) -> Seen {
@@ -230,7 +228,7 @@ mod tests {
     #[test]
     fn the_evidence_taken_monitor_by_monitor_is_that_of_one_large_matrix() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let fitted = Fitted::unfitted(&data, &Hypothesis::default()).unwrap();
         let (linearised, settings) = (Linearised::from_fit(&fitted, 0.0), &data.settings);
         let (monitors, some) = ([0, 3, 20], [0, 1, 5, 30, 31, 60]);
@@ -252,14 +250,11 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn vars_that_adapt_stay_where_vars_can_be() {
-        let (ring, template) = template();
+        let ring = template().0;
         let vars = simulate::vars(&ring, true, 7_752_658_534_036_229_640).unwrap();
         let drift = Unmodelled::of(UnmodelledKind::OrbitDrift, &ring, 7_620_465_084_028_654_614);
         assert_eq!((drift.site.name(&ring).as_str(), (1e6 * drift.size).round()), ("H_B6", 86.0));
-        let hardware = Hardware::shipped(&ring, &template);
-        let beyond: &[&dyn Beyond] = &[&drift];
-        let truth = simulate::Truth { vars: &vars, effects: &[], beyond };
-        let recording = simulate::campaign(&template, &ring, &truth, &hardware, 10_397_415_869_173_073_767).unwrap();
+        let recording = simulated(&vars, &[], &[&drift], 10_397_415_869_173_073_767);
         let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
         let off = found.vars_after.nees(&DVector::from_vec(vars).map(f64::ln));
@@ -274,8 +269,8 @@ mod tests {
         let (ring, recording) = template();
         let white = Coloured::white(&ring, &recording, 5);
         let noise = Coloured { slow: (0.2, 10.0), momentum: 6e-5, crate_share: 0.2, ..white };
-        let data = Data::from_campaign(&Campaign::of(&ring, &noise.campaign(&ring, &recording, &[])).unwrap()).unwrap();
-        assert!(data.noise.momentum.value > 0.0 && data.noise.crates.len() == 1 && !data.noise.slow.is_none());
+        let data = whitened(&ring, &noise.campaign(&ring, &recording, &[]));
+        assert!(data.noise.momentum.value > 0.0 && data.noise.crate_share.value > 0.0 && !data.noise.slow.is_none());
         let fitted = Fitted::from_guess(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
         let (linearised, seen) = (Linearised::from_fit(&fitted, 0.0), seen_of(&data, &fitted));
         let own = Seen::from_fit(&fitted, 0..fitted.residual.len());
@@ -297,7 +292,7 @@ mod tests {
         }
         let indicator = data.settings.indicator();
         let sums: Vec<Sums> = (0..data.monitors()).map(|b| data.sums(b, &seen, &indicator)).collect();
-        let (machine, drives) = fitted.machine(&data).unwrap();
+        let (machine, drives) = fitted.machine(&data, 0).unwrap();
         let read = |pattern: &DVector<f64>| {
             DVector::from_fn(pattern.len(), |b, _| if monitors.contains(&b) { pattern[b] } else { 0.0 })
         };

@@ -73,16 +73,6 @@ impl Linear {
         }
     }
 
-    /// In a few words.
-    pub(super) fn short(self) -> &'static str {
-        match self {
-            Self::Focuses => "focusing",
-            Self::Couples => "coupling",
-            Self::FocusesAndCouples => "focusing and coupling",
-            Self::Turns => "turning",
-        }
-    }
-
     /// As a predicate.
     pub(super) fn phrase(self) -> &'static str {
         match self {

@@ -62,16 +62,15 @@ impl Exact {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::Data;
-    use crate::testing::{ideal, template};
+    use crate::testing::{template, whitened};
     use inference::recording::Row;
-    use inference::{Campaign, simulate};
+    use inference::simulate::{self, Hardware};
     use twin::{Kind, Plane, Rf};
 
     #[test]
     fn tunes_move_in_proportion_to_the_kicks() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let machine = Machine::new(ring, Rf::FixedMomentum, &[]).unwrap();
         let by = |scale: f64| {
             let drives = Drives { kick: &data.drives.kick * scale, ..data.drives.clone() };
@@ -93,10 +92,12 @@ mod tests {
         let (mut ring, recording) = template();
         let at = ring.element("SXH_E6").unwrap();
         ring.elements[at].kind = Kind::Sextupole { k2: 2.0 / ring.elements[at].length };
+        let noise = vec![0.0; ring.read_monitors.len()];
+        let ideal = Hardware { misalignment: [1.8e-4; 2], offset: 0.0, noise, jumps: Vec::new(), tune_noise: 0.0 };
         for seed in 0..4 {
             let truth = simulate::Truth { vars: &[1.0; 48], ..Default::default() };
-            let made = simulate::campaign(&recording, &ring, &truth, &ideal(&ring), seed).unwrap();
-            let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+            let made = simulate::campaign(&recording, &ring, &truth, &ideal, seed).unwrap();
+            let data = whitened(&ring, &made);
             let at_supplies = ring.with_strengths(&ring.strengths(&[], &data.supplies));
             let design = Machine::new(at_supplies, Rf::FixedMomentum, &[]).unwrap();
             let optics = design.optics().unwrap();

@@ -1,15 +1,14 @@
 //! Experiment design: how well one more campaign of the same length would separate two causes.
 //!
-//! The expected `ln` Bayes factor of the true cause over its rival ([`Rivals`]), from the whitened signatures of the present and
+//! The expected `ln` Bayes factor of the true cause over its rival ([`expected`]), from the whitened signatures of the present and
 //! the new campaign together, all vars adapting.
 
 use nalgebra::{DMatrix, DVector};
 use twin::{Drives, Machine, Quadrupole, Signatures};
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
-use super::scan::Rivals;
+use super::fit::{FitError, Fitted};
+use super::scan::expected;
 use super::term::Term;
 
 /// What a possible measurement changes of the present one.
@@ -61,9 +60,6 @@ struct Derivatives {
 
 impl Menu {
     /// For a cause of some amplitude and its rival (another cause, or none), beside a fit.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub fn from_causes(
         data: &Data,
         fitted: &Fitted,
@@ -72,12 +68,12 @@ impl Menu {
     ) -> Result<Self, FitError> {
         let sigma = &fitted.units.sigma;
         let of_recording = |campaign: usize| {
-            let (machine, drives) = fitted.machine_in(data, campaign)?;
+            let (machine, drives) = fitted.machine(data, campaign)?;
             let weight = data.momentum / data.campaign(campaign).momentum;
             Derivatives::from_machine(data.campaign(campaign), (&machine, &drives), sigma, (one.0, other), weight)
         };
         let present: Vec<Derivatives> = (0..data.count()).map(of_recording).collect::<Result<_, _>>()?;
-        let (machine, drives) = fitted.machine(data)?;
+        let (machine, drives) = fitted.machine(data, 0)?;
         let amplitude = one.1 / one.0.kind.prior_scale().unwrap_or(1.0);
         let free = [Some(one.0), other].map(|term| term.is_some_and(|term| !term.kind.is_switch()));
         let mut proposals = Vec::new();
@@ -200,5 +196,5 @@ fn separation(campaigns: &[&Derivatives], amplitude: f64, free: [bool; 2]) -> f6
     let taken = factor.solve(&with_one);
     let (h, c) = (one - with_one.dot(&taken), both - with_other.dot(&taken));
     let rival = other - with_other.dot(&factor.solve(&with_other));
-    Rivals { power: h, rival, both: c, free }.expected(amplitude)
+    expected(amplitude, [h, c, rival], free)
 }

@@ -16,6 +16,8 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::columns::beside;
+
 /// A fit of unknown patterns beside known ones.
 #[derive(Debug, Clone)]
 pub struct Factors {
@@ -103,8 +105,7 @@ impl Factors {
 impl<'s> Fit<'s> {
     fn new(seen: &'s Seen, known: &DMatrix<f64>, start: &DMatrix<f64>, width: f64) -> Self {
         let (monitors, unknown) = (known.nrows(), start.ncols());
-        let mut mean = known.clone().insert_columns(known.ncols(), unknown, 0.0);
-        mean.columns_range_mut(known.ncols()..).copy_from(start);
+        let mean = beside(known.clone(), start);
         let own = mean.row_iter().map(|row| (1.0 - row.norm_squared()).max(LEAST)).collect();
         let covariance = vec![DMatrix::zeros(unknown, unknown); monitors];
         Self { seen, known: known.ncols(), variance: width * width, mean, covariance, own }
@@ -195,16 +196,12 @@ impl<'s> Fit<'s> {
 mod tests {
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
+    use crate::testing::normal;
 
     const FRAMES: usize = 240;
     const MONITORS: usize = 30;
-
-    fn normal(random: &mut StdRng) -> f64 {
-        StandardNormal.sample(random)
-    }
 
     /// Differences with some patterns in common, a tenth of them missing.
     fn differences(frames: usize, patterns: &DMatrix<f64>, random: &mut StdRng) -> Seen {

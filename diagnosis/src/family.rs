@@ -7,7 +7,7 @@ use super::close_tunes;
 use super::data::Data;
 use super::feed_down;
 use super::term::Term;
-use super::unknown::{Member, Unknown, is_absorbed};
+use super::unknown::{Member, Quantity, Unknown, is_absorbed};
 
 /// Which members share an amplitude.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,8 +47,9 @@ const HIDDEN: f64 = 0.15;
 /// families, half of the difference a roll; the electronics of all monitors have a common factor; a dipole's poles are parallel to
 /// 1 % of its aperture; iron keeps per mille of its field; eddy currents as in [`EffectKind::prior_scale`]. What decks differ by is [`BaseTerm`]'s.
 ///
-/// Those that change the focusing come first: the vars absorb most of them, so that a fit takes them as exactly as the vars.
-const FAMILIES: [Family; 18] = [
+/// Those that change the focusing come first: the vars absorb most of them, so that a fit takes them as exactly as the vars. The last is what the orbit adds
+/// that nobody knows.
+const FAMILIES: [Family; 19] = [
     Family::of_base(BaseTerm::DipoleGradient, Grouping::All),
     Family::of_base(BaseTerm::DipoleEdge, Grouping::All),
     Family::of("sextupole in all dipoles", EffectKind::DipoleSextupole, Grouping::All, 0.1),
@@ -67,24 +68,18 @@ const FAMILIES: [Family; 18] = [
     Family::of("couplings of correctors", EffectKind::CorrectorCoupling, Grouping::Instrument, 0.01),
     Family::of("hysteresis of all correctors", EffectKind::CorrectorHysteresis, Grouping::All, 5e-3),
     Family::of("rolls of quadrupoles", EffectKind::QuadRoll, Grouping::Each, close_tunes::ROLL),
+    Family::of("orbit in sextupoles", EffectKind::QuadRoll, Grouping::OfOrbit, 1.0),
 ];
 
 impl Family {
     /// All of them, and what the orbit adds that nobody knows.
     pub fn all() -> Vec<Self> {
-        let of_orbit = Self {
-            name: "orbit in sextupoles",
-            kind: EffectKind::QuadRoll,
-            grouping: Grouping::OfOrbit,
-            tolerance: 1.0,
-            width: 1.0,
-        };
-        Self::of_machine().into_iter().chain([of_orbit]).collect()
+        FAMILIES.to_vec()
     }
 
     /// Those of magnets and instruments.
     pub fn of_machine() -> Vec<Self> {
-        FAMILIES.to_vec()
+        FAMILIES[..FAMILIES.len() - 1].to_vec()
     }
 
     /// As wide as its tolerance.
@@ -99,34 +94,35 @@ impl Family {
 
     /// Its members; of a family that each recording has for itself those of each.
     pub fn members(&self, data: &Data) -> Vec<Member> {
-        self.members_with_widths(data).map(|(member, _)| member).collect()
+        self.members_with_widths(data).into_iter().map(|(member, _)| member).collect()
     }
 
     /// Its members as unknowns of a fit.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
-        self.members_with_widths(data).map(|(member, width)| Unknown::Ordinary(member, width)).collect()
+        let unknown = |(member, sigma)| Unknown { quantity: Quantity::Ordinary(member), sigma };
+        self.members_with_widths(data).into_iter().map(unknown).collect()
     }
 
-    fn members_with_widths(&self, data: &Data) -> impl Iterator<Item = (Member, f64)> {
+    fn members_with_widths(&self, data: &Data) -> Vec<(Member, f64)> {
         let rolls: Vec<Vec<f64>> = match self.grouping {
             Grouping::OfOrbit => data.campaigns().map(|own| feed_down::rolls(&own.ring, &own.baseline)).collect(),
             _ => Vec::new(),
         };
-        let width = move |member: &Member| match (member.campaign, member.terms[0].site) {
-            (Some(own), Site::Quadrupole(at)) => self.width * rolls[own][at],
-            _ => self.width,
-        };
         let campaigns: Vec<Option<usize>> =
             if self.is_of_each() { (0..data.count()).map(Some).collect() } else { vec![None] };
-        let of_each = move |terms: Vec<Term>| {
-            let member = move |campaign| Member { family: self.name, terms: terms.clone(), campaign };
-            campaigns.clone().into_iter().map(member)
-        };
-        let with_width = move |member: Member| {
-            let width = width(&member);
-            (width > 0.0).then_some((member, width))
-        };
-        self.terms(data).into_iter().flat_map(of_each).filter_map(with_width)
+        let mut all = Vec::new();
+        for terms in self.terms(data) {
+            for &campaign in &campaigns {
+                let width = match (campaign, terms[0].site) {
+                    (Some(own), Site::Quadrupole(at)) => self.width * rolls[own][at],
+                    _ => self.width,
+                };
+                if width > 0.0 {
+                    all.push((Member { family: self.name, terms: terms.clone(), campaign }, width));
+                }
+            }
+        }
+        all
     }
 
     /// True for what each recording has for itself: the momentum and fields of eddy currents, which differ between two times in the cycle, and the orbit.

@@ -40,19 +40,17 @@ fn sextupoles(ring: &Ring) -> impl Iterator<Item = (usize, f64)> {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
     use nalgebra::DVector;
     use twin::{EffectKind, Machine, Rf, Signatures, Site};
 
     use super::*;
-    use crate::data::Data;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     /// A sextupole of K2L = 2 /m^2 between two quadrupoles, which the orbit passes 1 mm higher: what the fit's machine sees of it is a roll of the nearest one.
     #[test]
     fn an_orbit_in_a_sextupole_is_a_roll_of_the_nearest_quadrupole() {
         let (mut ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let baseline = |y: f64| {
             let mut baseline = data.baseline.clone();
             baseline.sigma.iter_mut().for_each(|sigma| sigma[1] = y);

@@ -8,19 +8,17 @@
 //! the data is included, since hypotheses with drifting baselines change their covariance. The ordinary imperfections, many and
 //! small, are taken to first order about the start of the fit (gains no lower than -0.5), but for those that change the focusing.
 
-use core::ops::{Mul, Sub};
-
 use nalgebra::{DMatrix, DVector};
-use twin::{Drives, EffectError, EffectKind, Machine, Measured, Signature, Signatures};
+use twin::{Drives, EffectError, EffectKind, Machine, Measured, OrbitError, Signature, Signatures};
 
+use super::columns::beside;
 use super::data::Data;
 use super::element::Form;
-use super::error::FitError;
 use super::family::Family;
 use super::hypothesis::Hypothesis;
 use super::term::Term;
 use super::units::{BoundedGaussian, Units};
-use super::unknown::{Member, Unknown};
+use super::unknown::{Quantity, Unknown};
 use evidence::{Factor, gram};
 use inference::{Limits, Objective, OptimiseError, Quadratic, minimise};
 
@@ -50,7 +48,25 @@ pub struct Fitted {
     /// `J^T r - u`, zero for the vars that are held.
     pub slope: DVector<f64>,
     /// The data as this fit has them, where they are its own: whitened for baselines that drift, or linearised about its machine.
-    own: Option<Box<Data>>,
+    pub(super) own: Option<Box<Data>>,
+}
+
+/// Why a hypothesis has no fit.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FitError {
+    /// No stable machine where the fit begins, or an effect that is not defined for this ring.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
+    /// A derivative is so large, or not a number, that the normal matrix is not positive.
+    #[error("the normal matrix of a fit is not positive")]
+    Degenerate,
+}
+
+impl From<OrbitError> for FitError {
+    fn from(error: OrbitError) -> Self {
+        Self::Effect(error.into())
+    }
 }
 
 const LIMITS: Limits = Limits { settled: 0.01, steps: 25, halvings: 6 };
@@ -78,13 +94,6 @@ struct Ordinary {
     slopes: DMatrix<f64>,
     /// `Z^T Z`.
     gram: DMatrix<f64>,
-}
-
-/// A point of the fit.
-struct Point {
-    u: DVector<f64>,
-    residual: DVector<f64>,
-    cost: f64,
 }
 
 impl Fitted {
@@ -117,26 +126,18 @@ impl Fitted {
     }
 
     /// The hypothesis at the prior's mean, linearised and not fitted.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub(crate) fn unfitted(data: &Data, hypothesis: &Hypothesis) -> Result<Self, FitError> {
         let u = DVector::zeros(data.units.len() + hypothesis.unknowns(data).len());
         let problem = Problem::new(data, hypothesis, &u)?;
         let (cost, residual) = problem.evaluate(&u)?;
         let (quadratic, slopes) = problem.linearise(&u, &residual)?;
         let factor = quadratic.factor().ok_or(FitError::Degenerate)?;
-        Self::from_point(&problem, Point { u, residual, cost }, factor, slopes)
+        Self::from_point(&problem, u, residual, cost, factor, slopes)
     }
 
     /// The data as this fit has them.
     pub fn data<'d>(&'d self, data: &'d Data) -> &'d Data {
         self.own.as_deref().unwrap_or(data)
-    }
-
-    /// True if it has data of its own.
-    pub(super) fn has_own(&self) -> bool {
-        self.own.is_some()
     }
 
     /// This fit, which was to some data, and is kept beside others; if it has data of its own, it keeps these.
@@ -156,21 +157,26 @@ impl Fitted {
             OptimiseError::Degenerate => FitError::Degenerate,
         })?;
         let factor = found.quadratic.factor().ok_or(FitError::Degenerate)?;
-        let here = Point { u: found.x, residual: found.point, cost: found.cost };
-        Self::from_point(&problem, here, factor, found.slopes)
+        Self::from_point(&problem, found.x, found.point, found.cost, factor, found.slopes)
     }
 
-    fn from_point(problem: &Problem, here: Point, factor: Factor, slopes: DMatrix<f64>) -> Result<Self, FitError> {
+    fn from_point(
+        problem: &Problem,
+        u: DVector<f64>,
+        residual: DVector<f64>,
+        cost: f64,
+        factor: Factor,
+        slopes: DMatrix<f64>,
+    ) -> Result<Self, FitError> {
         let (data, units) = (problem.data, problem.hypothesis.units(problem.data));
-        let jacobian = problem.ordinary.beside(slopes);
-        let params = units.params(&here.u);
-        let slope = jacobian.tr_mul(&here.residual) - &here.u;
-        let within = BoundedGaussian::from_precision(&factor, &here.u, slope, &units);
+        let jacobian = beside(slopes, &problem.ordinary.slopes);
+        let params = units.params(&u);
+        let slope = jacobian.tr_mul(&residual) - &u;
+        let within = BoundedGaussian::from_precision(&factor, &u, slope, &units);
         let BoundedGaussian { free, slope, log_det, log_inside } = within.ok_or(FitError::Degenerate)?;
         let log_prior = problem.hypothesis.log_prior();
-        let log_evidence = -0.5 * (here.cost + log_det + data.whole_log_det()) + log_inside + log_prior;
+        let log_evidence = -0.5 * (cost + log_det + data.whole_log_det()) + log_inside + log_prior;
         let hypothesis = problem.hypothesis.clone();
-        let Point { u, residual, cost } = here;
         Ok(Self {
             hypothesis,
             units,
@@ -191,10 +197,10 @@ impl Fitted {
     ///
     /// # Errors
     /// [`EffectError`] if there is no stable machine.
-    pub(crate) fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
+    pub fn density_at(&self, data: &Data, u: &DVector<f64>) -> Result<(f64, DVector<f64>), EffectError> {
         let problem = Problem::new(self.data(data), &self.hypothesis, u)?;
         let residual = problem.residual(u)?;
-        let slope = problem.ordinary.beside(problem.jacobian(u)?).tr_mul(&residual) - u;
+        let slope = beside(problem.jacobian(u)?, &problem.ordinary.slopes).tr_mul(&residual) - u;
         Ok((-0.5 * (residual.norm_squared() + u.norm_squared()), slope))
     }
 
@@ -227,31 +233,30 @@ impl Fitted {
 
     /// Angle by which its unknown element turns the planes [rad], if that is what it does.
     pub(crate) fn turned(&self, data: &Data) -> Option<Measured> {
-        let turns = |(i, unknown): (usize, &Unknown)| match unknown {
-            Unknown::Form(_, Form::Rotation, sigma) => Some((self.params.len() + i, *sigma)),
-            _ => None,
-        };
-        let (at, scale) = self.hypothesis.unknowns(data).iter().enumerate().find_map(turns)?;
+        let (at, scale) = self.find(data, |unknown| matches!(unknown.quantity, Quantity::Form(_, Form::Rotation)))?;
         let (value, sigma) = self.sized(at, scale);
         Some(Measured { value, sigma })
     }
 
     /// Index of the amplitude of a term among the unknowns, and its prior standard deviation.
     pub fn unknown(&self, data: &Data, term: usize) -> Option<(usize, f64)> {
+        let amplitude = Quantity::Amplitude(self.hypothesis.terms[term]);
+        self.find(data, |unknown| unknown.quantity == amplitude)
+    }
+
+    /// Index of an unknown, the first of a sort, and its prior standard deviation.
+    fn find(&self, data: &Data, is_of_sort: impl Fn(&Unknown) -> bool) -> Option<(usize, f64)> {
         let unknowns = self.hypothesis.unknowns(data);
-        unknowns.iter().enumerate().find_map(|(i, unknown)| match unknown {
-            Unknown::Amplitude(of, scale) if *of == term => Some((self.params.len() + i, *scale)),
-            _ => None,
-        })
+        let at = unknowns.iter().position(is_of_sort)?;
+        Some((self.params.len() + at, unknowns[at].sigma))
     }
 
     /// The best point as the start of a fit of another hypothesis: unknowns that both have keep their values.
     pub fn guess(&self, data: &Data, other: &Hypothesis) -> DVector<f64> {
         let unknowns = self.hypothesis.unknowns(data);
         let value = |unknown: &Unknown| {
-            let same = |(_, one): &(usize, &Unknown)| self.hypothesis.identity(one) == other.identity(unknown);
-            let (i, one) = unknowns.iter().enumerate().find(same)?;
-            Some(self.u[self.params.len() + i] * one.sigma() / unknown.sigma())
+            let at = unknowns.iter().position(|one| one.quantity == unknown.quantity)?;
+            Some(self.u[self.params.len() + at] * unknowns[at].sigma / unknown.sigma)
         };
         let others = other.unknowns(data);
         let units = other.units(data);
@@ -259,20 +264,12 @@ impl Fitted {
         DVector::from_vec(all.chain(others.iter().map(|unknown| value(unknown).unwrap_or(0.0))).collect())
     }
 
-    /// The machine at the best point, and its drives.
+    /// The machine at the best point in one of the recordings, and its drives.
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn machine(&self, data: &Data) -> Result<(Machine, Drives), EffectError> {
-        self.machine_in(data, 0)
-    }
-
-    /// The same in one of several recordings.
-    ///
-    /// # Errors
-    /// [`EffectError`].
-    pub(crate) fn machine_in(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
-        self.hypothesis.machine_in(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
+    pub fn machine(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
+        self.hypothesis.machine(data, campaign, &self.params, &self.u.as_slice()[self.params.len()..])
     }
 
     /// The same on its orbit.
@@ -280,14 +277,11 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn machine_on_orbit(&self, data: &Data, campaign: usize) -> Result<(Machine, Drives), EffectError> {
-        let (machine, drives) = self.machine_in(data, campaign)?;
+        let (machine, drives) = self.machine(data, campaign)?;
         Ok((machine.on_orbit(&drives.orbit), drives))
     }
 
     /// That in each recording.
-    ///
-    /// # Errors
-    /// [`EffectError`].
     pub(crate) fn machines_on_orbit(&self, data: &Data) -> Result<Vec<(Machine, Drives)>, EffectError> {
         (0..data.count()).map(|campaign| self.machine_on_orbit(data, campaign)).collect()
     }
@@ -297,7 +291,7 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn tunes_of_element(&self, data: &Data) -> Result<[f64; 2], EffectError> {
-        let (machine, drives) = self.machine(data)?;
+        let (machine, drives) = self.machine(data, 0)?;
         let prediction = of_element(self.data(data), &self.hypothesis, 0, (&machine, &drives), &self.u)?;
         Ok(prediction.map_or([0.0; 2], |prediction| prediction.tunes))
     }
@@ -305,25 +299,17 @@ impl Fitted {
     /// True if the exact machine at the best point keeps a beam, its ordinary imperfections not only to first order.
     pub(crate) fn is_stable(&self, data: &Data) -> bool {
         let keeps = |campaign: usize| {
-            self.machine_in(data, campaign).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
+            self.machine(data, campaign).is_ok_and(|(machine, drives)| machine.readings(&drives).is_ok())
         };
         (0..data.count()).all(keeps)
     }
 
-    /// Predictions at the best point, rows pools, columns monitors [m], then the two tunes [1].
+    /// Predictions at the best point for one of the recordings, rows pools, columns monitors [m], then the two tunes [1].
     ///
     /// # Errors
     /// [`EffectError`].
-    pub fn predicted(&self, data: &Data) -> Result<DMatrix<f64>, EffectError> {
-        self.predicted_in(data, 0)
-    }
-
-    /// The same in one of several recordings.
-    ///
-    /// # Errors
-    /// [`EffectError`].
-    pub(crate) fn predicted_in(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
-        Ok(self.predicted_at(data, campaign, &self.u)?.by_frame())
+    pub fn predicted(&self, data: &Data, campaign: usize) -> Result<DMatrix<f64>, EffectError> {
+        Ok(predicted_by(data, &self.hypothesis, campaign, &self.u)?.by_frame())
     }
 
     /// Whitened residuals of some data at the best point of this fit, which may be of others.
@@ -331,16 +317,12 @@ impl Fitted {
     /// # Errors
     /// [`EffectError`].
     pub fn residual_of(&self, data: &Data) -> Result<DVector<f64>, EffectError> {
-        data.stacked(|campaign, own| Ok(own.residual(&self.predicted_at(data, campaign, &self.u)?)))
+        data.stacked(|campaign, own| Ok(own.residual(&predicted_by(data, &self.hypothesis, campaign, &self.u)?)))
     }
 
     /// Its cost for other readings; infinite where its machine keeps no beam in them.
     pub(crate) fn cost_of(&self, data: &Data) -> f64 {
         self.residual_of(data).map_or(f64::INFINITY, |residual| residual.norm_squared() + self.u.norm_squared())
-    }
-
-    fn predicted_at(&self, data: &Data, campaign: usize, u: &DVector<f64>) -> Result<Signature, EffectError> {
-        predicted_by(data, &self.hypothesis, campaign, u)
     }
 
     /// Sum of (residual/noise)^2 over the readings of monitors in state ok, about baselines that follow supplies and RF (and drift), per
@@ -352,7 +334,7 @@ impl Fitted {
         let data = self.data(data);
         let (mut sum, mut degrees) = (0.0, 0.0);
         for (campaign, own) in data.campaigns().enumerate() {
-            let (chi2, freedom) = own.chi_square(&self.predicted_in(data, campaign)?);
+            let (chi2, freedom) = own.chi_square(&self.predicted(data, campaign)?);
             (sum, degrees) = (sum + chi2, degrees + freedom);
         }
         Ok(sum / (degrees - self.params.len() as f64))
@@ -361,23 +343,20 @@ impl Fitted {
     /// Step of `ln` of the vars, and its covariance, were the same unknowns as wide as those of another hypothesis and some families in the model
     /// besides: to first order. With `D` the ratios of the widths, `X` what the families do per width and `J' = (J D, X)`:
     /// `u' = (1 + J'^T J')^-1 J'^T (r + J u)`.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub(crate) fn widened(
         &self,
         data: &Data,
         other: &Hypothesis,
-        beside: &[Family],
+        more: &[Family],
     ) -> Result<(DVector<f64>, DMatrix<f64>), FitError> {
         let data = self.data(data);
         let (own, others) = (self.hypothesis.unknowns(data), other.unknowns(data));
-        let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma() / own.sigma());
+        let ratios = own.iter().zip(&others).map(|(own, other)| other.sigma / own.sigma);
         let wider = DVector::from_iterator(self.u.len(), core::iter::repeat_n(1.0, self.params.len()).chain(ratios));
-        let besides: Vec<Unknown> = beside.iter().flat_map(|family| family.unknowns(data)).collect();
+        let besides: Vec<Unknown> = more.iter().flat_map(|family| family.unknowns(data)).collect();
         let machine = |campaign: usize| machine_at(data, &self.hypothesis, campaign, &self.u);
         let none = DVector::zeros(besides.len());
-        let mut all = Ordinary::about(data, &besides, &none, machine)?.beside(self.jacobian.clone());
+        let mut all = beside(self.jacobian.clone(), &Ordinary::about(data, &besides, &none, machine)?.slopes);
         all.column_iter_mut().zip(&wider).for_each(|(mut column, wider)| column *= *wider);
         let left = &self.residual + &self.jacobian * &self.u;
         let identity = DMatrix::identity(all.ncols(), all.ncols());
@@ -448,7 +427,8 @@ impl<'d> Problem<'d> {
             let of_others = of_others.map(|(unknown, u)| of_linear(data, campaign, &signatures, unknown, *u));
             own.signatures(into, of_vars.chain(of_others))
         })?;
-        let is_exact = |i: &usize| matches!(self.unknowns[i - vars], Unknown::Amplitude(..) | Unknown::Orbit(..));
+        let is_exact =
+            |i: &usize| matches!(self.unknowns[i - vars].quantity, Quantity::Amplitude(_) | Quantity::Orbit(..));
         for i in (vars..self.others()).filter(is_exact) {
             let at = |step: f64| {
                 let mut u = u.clone();
@@ -480,14 +460,6 @@ impl Ordinary {
         let gram = gram(&slopes);
         Ok(Self { slopes, gram })
     }
-
-    /// The derivatives of all unknowns, from those of the others.
-    fn beside(&self, others: DMatrix<f64>) -> DMatrix<f64> {
-        let first = others.ncols();
-        let mut all = others.insert_columns(first, self.slopes.ncols(), 0.0);
-        all.columns_range_mut(first..).copy_from(&self.slopes);
-        all
-    }
 }
 
 /// The machine of a recording at some unknowns, the vars first, and its drives.
@@ -497,7 +469,7 @@ fn machine_at(
     campaign: usize,
     u: &DVector<f64>,
 ) -> Result<(Machine, Drives), EffectError> {
-    hypothesis.machine_in(data, campaign, &hypothesis.units(data).params(u), &u.as_slice()[data.units.len()..])
+    hypothesis.machine(data, campaign, &hypothesis.units(data).params(u), &u.as_slice()[data.units.len()..])
 }
 
 /// What a hypothesis predicts in a recording: its machine, and to first order about that its unknown element. How the vars change what the element does is
@@ -537,17 +509,20 @@ pub fn of_element(
     let signatures = Signatures::of(&machine, drives)?;
     let unknowns = hypothesis.unknowns(data);
     let forms = unknowns.iter().zip(u.iter().skip(data.units.len()));
-    let forms = forms.filter(|(unknown, _)| matches!(unknown, Unknown::Form(..)));
-    let mut sum: Option<Signature> = None;
-    for (unknown, u) in forms {
-        let Some(form) = of_linear(data, campaign, &signatures, unknown, *u)? else { continue };
-        let form = form * *u;
-        match &mut sum {
-            None => sum = Some(form),
-            Some(sum) => *sum += form,
-        }
+    let forms = forms.filter(|(unknown, _)| matches!(unknown.quantity, Quantity::Form(..)));
+    summed(forms.filter_map(|(unknown, u)| {
+        let form = of_linear(data, campaign, &signatures, unknown, *u).transpose()?;
+        Some(form.map(|form| form * *u))
+    }))
+}
+
+/// The sum of some signatures, if there are any.
+fn summed(mut each: impl Iterator<Item = Result<Signature, EffectError>>) -> Result<Option<Signature>, EffectError> {
+    let Some(mut sum) = each.next().transpose()? else { return Ok(None) };
+    for one in each {
+        sum += one?;
     }
-    Ok(sum)
+    Ok(Some(sum))
 }
 
 /// What a machine predicts.
@@ -569,35 +544,21 @@ fn of_linear(
     unknown: &Unknown,
     u: f64,
 ) -> Result<Option<Signature>, EffectError> {
-    match unknown {
-        Unknown::Ordinary(member, width) if member.is_in(campaign) => {
-            let one_more = together(signatures, member, |kind| data.scale(campaign, kind))?;
-            Ok(Some(one_more * (width / member.factor(u * width))))
+    let Unknown { quantity, sigma } = unknown;
+    match quantity {
+        Quantity::Ordinary(member) if member.is_in(campaign) => {
+            let of_term =
+                |term: &Term| Ok(signatures.of_effect(term.kind, term.site)? * data.scale(campaign, term.kind));
+            let one_more = summed(member.terms.iter().map(of_term))?;
+            Ok(one_more.map(|one_more| one_more * (sigma / member.factor(u * sigma))))
         }
-        Unknown::Form(quadrupole, form, sigma) => {
+        Quantity::Form(quadrupole, form) => {
             // as a field that is no magnet of the ring
             let scale = data.scale(campaign, EffectKind::StrayGradient);
             Ok(Some(form.signature(signatures, &data.ring, *quadrupole) * (*sigma * scale)))
         }
         _ => Ok(None),
     }
-}
-
-/// The sum of the signatures of effects that share an amplitude, each by the scale of its kind.
-fn together(
-    signatures: &Signatures,
-    member: &Member,
-    scale: impl Fn(EffectKind) -> f64,
-) -> Result<Signature, EffectError> {
-    let signature = |term: &Term| -> Result<Signature, EffectError> {
-        Ok(signatures.of_effect(term.kind, term.site)? * scale(term.kind))
-    };
-    let mut of_each = member.terms.iter().map(signature);
-    let first = of_each.next().expect("a family has members")?;
-    of_each.try_fold(first, |mut sum, one| {
-        sum += one?;
-        Ok(sum)
-    })
 }
 
 impl Objective for Problem<'_> {
@@ -634,9 +595,7 @@ impl Objective for Problem<'_> {
 }
 
 /// Derivative at 0. Next to a resonance one side has no stable machine, and the other one serves alone.
-fn difference<T: Sub<Output = T> + Mul<f64, Output = T>>(
-    at: impl Fn(f64) -> Result<T, EffectError>,
-) -> Result<T, EffectError> {
+fn difference(at: impl Fn(f64) -> Result<DVector<f64>, EffectError>) -> Result<DVector<f64>, EffectError> {
     match (at(DIFFERENCE), at(-DIFFERENCE)) {
         (Ok(above), Ok(below)) => Ok((above - below) * (2.0 * DIFFERENCE).recip()),
         (Ok(above), Err(_)) => Ok((above - at(0.0)?) * DIFFERENCE.recip()),
@@ -647,17 +606,15 @@ fn difference<T: Sub<Output = T> + Mul<f64, Output = T>>(
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-
     use super::*;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     /// Readings and kicks are linear in a gain, so that differences are its derivative to rounding; also beside instruments that are exchanged or reversed. Once the fit's machine
     /// had ordinary gains after the exchange and the derivative before it, so that a fit that was begun at its own end moved.
     #[test]
     fn the_derivative_of_a_gain_is_right_about_a_gain() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let beside = [
             "",
             "bpm_swap@y_C5,y_D5=1",
@@ -679,7 +636,7 @@ mod tests {
     #[test]
     fn one_more_effect_is_scored_as_it_is_fitted() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let term = |text: &str| Term::from(twin::Effect::parse(&format!("{text}=1"), &ring).unwrap());
         let (monitors, correctors) = ("bpm_swap@y_C5,y_D5", "corrector_swap@V_D3,V_D7");
         let after = [
@@ -718,10 +675,11 @@ mod tests {
     /// Largest error of the derivative with respect to an ordinary gain, about one of -30 %, over its largest element.
     fn off_by_differences(data: &Data, hypothesis: &Hypothesis, gain: Term) -> f64 {
         let (vars, unknowns) = (data.units.len(), hypothesis.unknowns(data));
-        let is_it = |unknown: &Unknown| matches!(unknown, Unknown::Ordinary(member, _) if member.terms == [gain]);
+        let is_it =
+            |unknown: &Unknown| matches!(&unknown.quantity, Quantity::Ordinary(member) if member.terms == [gain]);
         let at = vars + unknowns.iter().position(is_it).unwrap();
         let mut start = DVector::zeros(vars + unknowns.len());
-        start[at] = -0.3 / unknowns[at - vars].sigma();
+        start[at] = -0.3 / unknowns[at - vars].sigma;
         let residual = |step: f64| {
             let mut u = start.clone();
             u[at] += step;

@@ -10,7 +10,7 @@ use crate::fit::Fitted;
 use crate::hypothesis::Hypothesis;
 use crate::scan::{Projection, candidates, scan};
 use crate::term::Term;
-use crate::testing::template;
+use crate::testing::{template, whitened};
 use inference::Campaign;
 use inference::recording::Recording;
 use inference::simulate::{self, Beyond, Hardware, Truth};
@@ -83,7 +83,8 @@ impl Standard {
         let readings = DMatrix::from_fn(n, self.hardware.noise.len(), noise);
         let mut data = data.less(&readings, &DMatrix::from_fn(n, 2, tune_noise));
         data.drives.orbit = Machine::new(ring, Rf::FixedMomentum, &[effect]).ok()?.orbit().ok()?;
-        data.baseline = data.baseline.known();
+        // the orbit is known, whatever the monitors read
+        data.baseline.share.fill(0.0);
         if let (EffectKind::SextupoleError, Site::Element(at)) = (effect.kind, effect.site) {
             // what it makes depends on the orbit in its middle
             let [[x, y], [next_x, next_y]] = [data.drives.orbit[at], data.drives.orbit[at + 1]];
@@ -99,14 +100,14 @@ impl Standard {
         let hypothesis = Hypothesis { given: vec![effect], ..Hypothesis::default() };
         let mut fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(data.units.len())).unwrap();
         for _ in 0..PASSES {
-            let (machine, drives) = fitted.machine(&data).unwrap();
+            let (machine, drives) = fitted.machine(&data, 0).unwrap();
             data.linearise_about(&machine, &drives.orbit).unwrap();
             fitted = Fitted::from_guess(&data, &hypothesis, &fitted.u).unwrap();
         }
         let (machine, drives) = fitted.machine_on_orbit(&data, 0).unwrap();
         let signature = Signatures::of(&machine, &drives).unwrap().of_effect(effect.kind, effect.site).unwrap();
         let column = fitted.data(&data).signature(&signature) * effect.kind.prior_scale().unwrap_or(1.0);
-        let score = Projection::from_fit(&fitted).score(&DMatrix::from_columns(&[column])).scores[0];
+        let score = Projection::from_fit(&fitted).score(&DMatrix::from_columns(&[column])).0[0];
         Some(score.pull / (1.0 + score.power).sqrt())
     }
 
@@ -119,7 +120,7 @@ impl Standard {
 
     /// The place of each kind that the campaign sees best.
     fn best_seen(&self) -> Vec<Term> {
-        let data = Data::from_campaign(&Campaign::of(&self.ring, &self.noisy).unwrap()).unwrap();
+        let data = whitened(&self.ring, &self.noisy);
         let pair = self.template.header.radial_loop_monitors.as_ref();
         let null = Fitted::from_guess(&data, &Hypothesis::default(), &DVector::zeros(data.units.len())).unwrap();
         let scanned = scan(&data, &null, &candidates(&data, pair)).unwrap();

@@ -21,10 +21,12 @@ use core::f64::consts::{E, FRAC_PI_2, LN_2};
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Optics, OrbitError, Plane, Ring};
 
+use super::columns::beside;
 use super::factors::{Factors, Seen};
-use super::jitter::{Differences, with_column};
+use super::jitter::Differences;
 use super::laplace::Peak;
 use super::period::Period;
+use super::transients::run_means;
 
 /// What a pattern is like.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,9 +97,6 @@ const OCTAVES: f64 = 7.0;
 
 impl Shape {
     /// All of some optics, at the read monitors.
-    ///
-    /// # Errors
-    /// [`OrbitError`] of unstable motion.
     pub fn all(optics: &Optics, ring: &Ring) -> Result<Vec<Self>, OrbitError> {
         let twiss = optics.twiss()?;
         let observers = optics.read_monitors();
@@ -243,7 +242,7 @@ fn known_shape<'s>(near: &Differences, known: &DMatrix<f64>, shapes: &'s [Shape]
     let without = near.log_likelihood(known);
     let with = |shape: &Shape, size: f64| {
         let columns = shape.columns.column_iter().map(|column| column * size);
-        near.log_likelihood(&columns.fold(known.clone(), |modes, column| with_column(&modes, &column))) - without
+        near.log_likelihood(&columns.fold(known.clone(), |modes, column| beside(modes, &column))) - without
     };
     let range = -SMALLEST.ln();
     let sizes = (0..SIZES).map(|i| -range * (i as f64 + 0.5) / SIZES as f64);
@@ -277,27 +276,18 @@ pub fn beyond_chance(log_chance: f64) -> f64 {
 }
 
 /// Amplitudes of the largest of some patterns [m] in each frame, from readings less their prediction about the mean of their run, not a
-/// number where there is none; `noise` of each monitor [m], none for one that does not count.
-pub fn amplitudes(patterns: &DMatrix<f64>, residual: &DMatrix<f64>, noise: &[Option<f64>], runs: &[usize]) -> Vec<f64> {
+/// number where there is none; `noise` of each monitor [m], none for one that does not count. `settings`: that of each frame.
+pub fn amplitudes(
+    patterns: &DMatrix<f64>,
+    residual: &DMatrix<f64>,
+    noise: &[Option<f64>],
+    settings: &[Option<usize>],
+) -> Vec<f64> {
     let monitors: Vec<usize> = (0..noise.len()).filter(|&b| noise[b].is_some()).collect();
     let weight = |b: usize| noise[b].map_or(0.0, |noise| noise.powi(-2));
     let largest = patterns.clone().svd(false, true).v_t.map(|v| patterns * v.row(0).transpose());
     let Some(pattern) = largest else { return vec![f64::NAN; residual.nrows()] };
-    let mut about = residual.clone();
-    for &b in &monitors {
-        let mut column = about.column_mut(b);
-        let mut start = 0;
-        for end in 1..=runs.len() {
-            if end < runs.len() && runs[end] == runs[start] {
-                continue;
-            }
-            let mut run = column.rows_range_mut(start..end);
-            let known: Vec<f64> = run.iter().copied().filter(|value| !value.is_nan()).collect();
-            let mean = known.iter().sum::<f64>() / known.len() as f64;
-            run.add_scalar_mut(-mean);
-            start = end;
-        }
-    }
+    let about = residual - run_means(residual, settings);
     let amplitude = |row: usize| {
         let seen = monitors.iter().filter(|&&b| !about[(row, b)].is_nan());
         let sum = |(pull, information): (f64, f64), &b: &usize| {
@@ -315,11 +305,9 @@ mod tests {
     use core::f64::consts::TAU;
 
     use estimator::MonitorState;
-    use inference::Campaign;
     use inference::recording::Recording;
     use rand::rngs::StdRng;
     use rand::{RngExt, SeedableRng};
-    use rand_distr::{Distribution, StandardNormal};
     use twin::Hold;
 
     use super::*;
@@ -329,12 +317,8 @@ mod tests {
     use crate::noise::Noise;
     use crate::odds::correction_of_sort;
     use crate::period::Recurs;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, normal, template, whitened};
     use crate::verdict::Verdict;
-
-    fn normal(random: &mut StdRng) -> f64 {
-        StandardNormal.sample(random)
-    }
 
     /// The shapes of the machine of some vars, and a campaign of it with one of them [m] of some amplitudes in each frame.
     struct Case {
@@ -377,7 +361,7 @@ mod tests {
         }
 
         fn learnt(&self, recording: &Recording) -> Noise {
-            Data::from_campaign(&Campaign::of(&self.ring, recording).unwrap()).unwrap().noise
+            whitened(&self.ring, recording).noise
         }
     }
 
@@ -506,7 +490,8 @@ mod tests {
             }
             all.iter_mut().skip(campaign).step_by(57).for_each(|z| *z = f64::NAN);
             let cost = 0.5 * 240_f64.ln();
-            let known = [Known { modes: none.clone(), cost: 0.0 }, Known { modes: with_column(&none, &jitter), cost }];
+            let known =
+                [Known { modes: none.clone(), cost: 0.0 }, Known { modes: beside(none.clone(), &jitter), cost }];
             let noise = vec![Some(case.noise.noise); monitors];
             logs.push(
                 Found::strongest(&Differences::from_frames(all), &known, &case.shapes, &noise)

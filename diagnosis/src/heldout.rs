@@ -23,8 +23,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::choice::Choice;
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::Hypothesis;
 use super::linearisation::about_itself;
 use super::scan::SignatureScore;
@@ -100,11 +99,6 @@ impl Score {
         Ok(Self { log_density, rms: (squares / ok.max(1) as f64).sqrt(), inside: inside.map(|count| count / n) })
     }
 
-    /// Readings of monitors and of the tune meter: means of pools.
-    pub fn readings(&self) -> usize {
-        self.log_density.len()
-    }
-
     /// Expected log predictive density.
     pub fn elpd(&self) -> f64 {
         self.log_density.iter().sum()
@@ -156,7 +150,7 @@ impl<'d> Precision<'d> {
         let mut start = 0;
         let mut channels = Vec::new();
         for (own, pools) in data.campaigns().zip(data.pools_of_each()) {
-            for (c, channel) in own.channels().iter().enumerate() {
+            for (c, channel) in own.channels.iter().enumerate() {
                 let n = channel.rows.len();
                 let back = channel.whiten(DMatrix::identity(n, n)).transpose();
                 let (jacobian, residual) = (fitted.jacobian.rows(start, n), fitted.residual.rows(start, n));
@@ -226,12 +220,12 @@ impl<'d> Precision<'d> {
         Ok(pulls.iter().zip(powers).map(|(&pull, power)| SignatureScore { pull, power }).collect())
     }
 
-    /// `ln` of the determinant of what monitors have in common in a block's pools.
+    /// `ln` of the determinant of what monitors have in common in a block's pools, in units of their own noise.
     fn mixed_log_det(&self, block: &Block) -> f64 {
         let of_each = self.data.campaigns().zip(self.data.pools_of_each()).map(|(own, pools)| {
             let inside: Vec<usize> = block.iter().filter_map(|pool| pool.checked_sub(pools.start)).collect();
             let inside: Vec<usize> = inside.into_iter().filter(|pool| *pool < own.pools.count).collect();
-            own.mixed_log_det(&inside)
+            inside.into_iter().map(|pool| own.mixing.log_det_of(pool)).sum::<f64>()
         });
         of_each.sum()
     }
@@ -265,9 +259,6 @@ const FOLDS: usize = 5;
 /// the others is larger by `exp(B - B_kept)` with the term than without; the mixture gains
 ///
 /// `ln(1 + sum of exp(B - penalty)) - ln(1 + sum of exp(B_kept - penalty))`.
-///
-/// # Errors
-/// [`FitError`].
 pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
     let (data, all) = (choice.data, &choice.scores);
     let precision = Precision::from_fit(data, choice.without);
@@ -292,49 +283,26 @@ pub fn gain_of_choice(choice: &Choice) -> Result<f64, FitError> {
     Ok(gain)
 }
 
-/// The same fit without its effects and its unknown element, what is ordinary being of the same size.
-///
-/// # Errors
-/// [`FitError`].
-pub fn bare(data: &Data, fitted: &Fitted) -> Result<Fitted, FitError> {
-    without_terms(data, fitted, &fitted.hypothesis.terms, &fitted.hypothesis.without_element())
-}
-
-/// The same fit without one of its terms, to compare its predictions with.
-///
-/// # Errors
-/// [`FitError`].
-pub fn rival(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
-    without_terms(data, fitted, &fitted.hypothesis.terms[term..=term], &fitted.hypothesis)
-}
-
-/// The fit of a hypothesis without some terms, and without the families that predict as these do.
-fn without_terms(data: &Data, fitted: &Fitted, terms: &[Term], from: &Hypothesis) -> Result<Fitted, FitError> {
+/// The fit of a hypothesis without some terms, and without the families that predict as these do, to compare its predictions with: what is ordinary keeps the
+/// size that it has in another fit.
+pub(super) fn without_terms(
+    data: &Data,
+    fitted: &Fitted,
+    terms: &[Term],
+    from: &Hypothesis,
+) -> Result<Fitted, FitError> {
     let less = from.without_terms(|term| terms.contains(term));
     lessened(data, fitted, terms.iter().fold(less, |less, term| less.without_family(*term, data)))
 }
 
-/// The same fit without one of its terms.
-///
-/// # Errors
-/// [`FitError`].
-pub fn reduced(data: &Data, fitted: &Fitted, term: usize) -> Result<Fitted, FitError> {
-    lessened(data, fitted, fitted.hypothesis.without(term))
-}
-
-/// The fit of a hypothesis with fewer effects.
+/// The fit of a hypothesis with fewer effects than another fit: vars that are stable with an effect may be unstable without it, and so may ordinary
+/// imperfections that grow in its place.
 pub(super) fn lessened(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
-    let less = from_near_or_far(data, fitted, other)?;
-    Ok(if data.is_about_effects { about_itself(data, less) } else { less })
-}
-
-/// The fit of another hypothesis: vars that are stable with an effect may be unstable without it, and so may ordinary imperfections that grow
-/// in its place.
-fn from_near_or_far(data: &Data, fitted: &Fitted, other: Hypothesis) -> Result<Fitted, FitError> {
     let far = DVector::zeros(fitted.params.len());
     let stable = |fitted: &Fitted| fitted.is_stable(data);
     let near = Fitted::from_guess(data, &other, &fitted.guess(data, &other)).ok().filter(stable);
     let other_than_near = || Fitted::from_guess(data, &other, &far).ok().filter(stable);
     let bare = Hypothesis { ordinary: Vec::new(), ..other.clone() };
-    near.or_else(other_than_near).map_or_else(|| Fitted::from_guess(data, &bare, &far), Ok)
+    let less = near.or_else(other_than_near).map_or_else(|| Fitted::from_guess(data, &bare, &far), Ok)?;
+    Ok(if data.is_about_effects { about_itself(data, less) } else { less })
 }

@@ -2,15 +2,15 @@
 
 use core::cmp::Reverse;
 
-use twin::{Drives, Effect, EffectError, EffectKind, Machine, Plane, Ring, Site};
+use twin::{Drives, Effect, EffectError, EffectKind, Machine, Ring, Site};
 
 use super::data::Data;
-use super::element::{Element, Form};
+use super::element::Element;
 use super::family::Family;
 use super::scatter::Scatter;
 use super::term::Term;
 use super::units::Units;
-use super::unknown::{Member, Unknown};
+use super::unknown::{Quantity, Unknown};
 
 /// Some effects, any number of them.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -33,19 +33,6 @@ pub struct Hypothesis {
 /// prior over that of others: a gain is then off by 40 %.
 const GROSS: f64 = 0.1;
 const WIDER: f64 = 5.0;
-
-/// What an unknown is the amplitude of, whatever its width.
-#[derive(Debug, PartialEq)]
-pub enum Identity<'u> {
-    /// A term.
-    Amplitude(Term),
-    /// The orbit of a recording at an element.
-    Orbit(usize, usize, Plane),
-    /// A form of an unknown element near a quadrupole.
-    Form(usize, Form),
-    /// An ordinary imperfection.
-    Ordinary(&'u Member),
-}
 
 impl Hypothesis {
     /// No effect, and everything ordinary.
@@ -100,32 +87,25 @@ impl Hypothesis {
         term.kind.prior_scale().map(|scale| scale * if self.gross.contains(term) { WIDER } else { 1.0 })
     }
 
-    /// What one of its unknowns is the amplitude of.
-    pub(crate) fn identity<'u>(&self, unknown: &'u Unknown) -> Identity<'u> {
-        match unknown {
-            Unknown::Amplitude(i, _) => Identity::Amplitude(self.terms[*i]),
-            Unknown::Orbit(campaign, element, plane, _) => Identity::Orbit(*campaign, *element, *plane),
-            Unknown::Form(quadrupole, form, _) => Identity::Form(*quadrupole, *form),
-            Unknown::Ordinary(member, _) => Identity::Ordinary(member),
-        }
-    }
-
     /// The unknowns besides the vars.
     pub fn unknowns(&self, data: &Data) -> Vec<Unknown> {
-        let of_term = |(i, term): (usize, &Term)| {
-            let amplitude = self.scale(term).map(|scale| Unknown::Amplitude(i, scale));
+        let of_term = |term: &Term| {
+            let quantity = Quantity::Amplitude(*term);
+            let amplitude = self.scale(term).map(|sigma| Unknown { quantity, sigma });
             let seen = term.kind.orbit(&data.ring, term.site);
             let orbit = data.campaigns().enumerate().flat_map(|(campaign, own)| {
-                seen.iter().map(move |&(element, plane)| {
-                    Unknown::Orbit(campaign, element, plane, own.baseline.sigma[element][plane.index()])
+                seen.iter().map(move |&(element, plane)| Unknown {
+                    quantity: Quantity::Orbit(campaign, element, plane),
+                    sigma: own.baseline.sigma[element][plane.index()],
                 })
             });
             amplitude.into_iter().chain(orbit).collect::<Vec<_>>()
         };
-        let terms = self.terms.iter().enumerate().flat_map(of_term);
+        let terms = self.terms.iter().flat_map(of_term);
         let of_element = |element: &Element| {
             let quadrupole = element.quadrupole;
-            element.forms.clone().into_iter().map(move |(form, sigma)| Unknown::Form(quadrupole, form, sigma))
+            let forms = element.forms.clone().into_iter();
+            forms.map(move |(form, sigma)| Unknown { quantity: Quantity::Form(quadrupole, form), sigma })
         };
         let forms = self.element.iter().flat_map(of_element);
         terms.chain(forms).chain(self.ordinary.iter().flat_map(|family| family.unknowns(data))).collect()
@@ -165,19 +145,12 @@ impl Hypothesis {
         self.terms.contains(term) || self.element.as_ref().is_some_and(|element| element.holds(term, ring))
     }
 
-    /// The machine and its drives at given `ln` vars and values of the unknowns in units of their standard deviations, without the unknown element.
+    /// The machine in one of the recordings and its drives, at given `ln` vars and values of the unknowns in units of their standard deviations, without the
+    /// unknown element.
     ///
     /// # Errors
     /// [`EffectError`] if an effect is not defined at its place.
-    pub fn machine(&self, data: &Data, params: &[f64], unknown: &[f64]) -> Result<(Machine, Drives), EffectError> {
-        self.machine_in(data, 0, params, unknown)
-    }
-
-    /// The same in one of several recordings.
-    ///
-    /// # Errors
-    /// [`EffectError`] if an effect is not defined at its place.
-    pub(crate) fn machine_in(
+    pub fn machine(
         &self,
         data: &Data,
         campaign: usize,
@@ -190,28 +163,25 @@ impl Hypothesis {
         effects.extend(&self.given);
         let mut ordinary = Vec::new();
         let mut drives = recording.drives.clone();
-        for (what, u) in self.unknowns(data).iter().zip(unknown) {
-            match what {
-                Unknown::Amplitude(i, sigma) => effects[*i] = scaled(&self.terms[*i], u * sigma),
-                Unknown::Orbit(of, element, plane, sigma) if *of == campaign => {
+        for (Unknown { quantity, sigma }, u) in self.unknowns(data).iter().zip(unknown) {
+            match quantity {
+                Quantity::Amplitude(term) => {
+                    let at = self.terms.iter().position(|one| one == term).expect("it is of one of the terms");
+                    effects[at] = scaled(term, u * sigma);
+                }
+                Quantity::Orbit(of, element, plane) if *of == campaign => {
                     drives.orbit[*element][plane.index()] += u * sigma;
                 }
-                Unknown::Ordinary(member, sigma) if member.is_in(campaign) => {
+                Quantity::Ordinary(member) if member.is_in(campaign) => {
                     ordinary.extend(member.terms.iter().map(|term| scaled(term, u * sigma)));
                 }
-                Unknown::Orbit(..) | Unknown::Form(..) | Unknown::Ordinary(..) => {}
+                Quantity::Orbit(..) | Quantity::Form(..) | Quantity::Ordinary(_) => {}
             }
         }
         let effects = in_order(effects, ordinary);
         effects.iter().for_each(|effect| correct_orbit(recording, &mut drives, effect));
         let ring = recording.ring.with_strengths(&recording.ring.strengths(params, &recording.supplies));
         Ok((Machine::new(ring, recording.believed, &effects)?, drives))
-    }
-
-    /// `kind@place + kind@place`, or `nothing`.
-    pub fn label(&self, ring: &Ring) -> String {
-        let terms: Vec<String> = self.terms.iter().map(|term| term.label(ring)).collect();
-        if terms.is_empty() { "nothing".into() } else { terms.join(" + ") }
     }
 }
 

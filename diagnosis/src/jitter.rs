@@ -13,6 +13,7 @@ use std::collections::BTreeMap;
 use nalgebra::{DMatrix, DVector};
 use twin::Measured;
 
+use super::columns::beside;
 use super::half_normal::HalfNormal;
 use super::laplace::Peak;
 
@@ -97,7 +98,7 @@ impl Differences {
     /// The rms momentum jitter of a pattern per momentum [1], with `width` that of its prior, beside known modes.
     pub fn momentum(&self, pattern: &DVector<f64>, width: f64, known: &DMatrix<f64>) -> Measured {
         let without = self.log_likelihood(known);
-        let with = |jitter: f64| self.log_likelihood(&with_column(known, &(pattern * jitter))) - without;
+        let with = |jitter: f64| self.log_likelihood(&beside(known.clone(), &(pattern * jitter))) - without;
         self.sampled(learnt(with, width, 0.0), 0.5)
     }
 
@@ -122,7 +123,7 @@ impl Differences {
             };
             let known = with_crates(others, &crates);
             let without = self.log_likelihood(&known);
-            let with = |share: f64| with_column(&known, &crate_mode(others.nrows(), group, share));
+            let with = |share: f64| beside(known.clone(), &crate_mode(others.nrows(), group, share));
             let share = learnt(|share| self.log_likelihood(&with(share)) - without, CRATE, correction);
             let share = self.sampled(Measured { value: share.value.min(1.0 - OWN), ..share }, 1.0);
             if share.value == 0.0 || crates.len() == MOST {
@@ -173,17 +174,10 @@ pub fn groups(orders: &[Vec<usize>]) -> Vec<&[usize]> {
     SIZES.flat_map(|size| orders.iter().flat_map(move |order| order.windows(size))).collect()
 }
 
-/// Modes, and one more.
-pub fn with_column(modes: &DMatrix<f64>, one: &DVector<f64>) -> DMatrix<f64> {
-    let mut all = modes.clone().insert_column(modes.ncols(), 0.0);
-    all.set_column(modes.ncols(), one);
-    all
-}
-
 /// Modes, and one for each crate.
 pub fn with_crates(modes: &DMatrix<f64>, crates: &[Crate]) -> DMatrix<f64> {
     let of_crate = |one: &Crate| crate_mode(modes.nrows(), &one.monitors, one.share.value);
-    crates.iter().fold(modes.clone(), |modes, one| with_column(&modes, &of_crate(one)))
+    crates.iter().fold(modes.clone(), |modes, one| beside(modes, &of_crate(one)))
 }
 
 /// The mode of a crate: the root of its share in each of its monitors.

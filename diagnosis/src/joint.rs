@@ -128,9 +128,6 @@ impl Data {
     }
 
     /// Whitened numbers of all, recording by recording: `of` is given its index and its data.
-    ///
-    /// # Errors
-    /// Those of `of`.
     pub(crate) fn stacked<E>(&self, of: impl Fn(usize, &Self) -> Result<DVector<f64>, E>) -> Result<DVector<f64>, E> {
         let mut all = DVector::zeros(self.whole_size());
         for ((index, one), rows) in self.campaigns().enumerate().zip(self.parts()) {
@@ -140,9 +137,6 @@ impl Data {
     }
 
     /// The same of several columns; `fill` fills the rows of one recording, which are 0.
-    ///
-    /// # Errors
-    /// Those of `fill`.
     pub(crate) fn stacked_columns<E>(
         &self,
         columns: usize,
@@ -167,7 +161,7 @@ impl Data {
     pub(crate) fn linearise_each(&mut self, fitted: &Fitted) -> Result<f64, EffectError> {
         let (mut linearised, mut moved) = (self.clone(), 0.0);
         for campaign in 0..self.count() {
-            let (machine, drives) = fitted.machine_in(self, campaign)?;
+            let (machine, drives) = fitted.machine(self, campaign)?;
             moved += linearised.campaign_mut(campaign).linearise_about(&machine, &drives.orbit)?;
         }
         *self = linearised;
@@ -188,7 +182,6 @@ impl Data {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
     use inference::recording::{Recording, at_energy};
     use twin::{Effect, Ring};
 
@@ -196,7 +189,7 @@ mod tests {
     use crate::hypothesis::Hypothesis;
     use crate::scan::signatures;
     use crate::term::Term;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, template, whitened};
     use crate::{Diagnosis, Verdict};
 
     /// Momentum of 1.5 GeV protons over that of 1 GeV.
@@ -227,7 +220,7 @@ mod tests {
 
     fn data_of(ring: &Ring, recording: &Recording) -> Data {
         let ring = at_energy(ring, recording.header.kinetic_energy);
-        Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap()
+        whitened(&ring, recording)
     }
 
     /// About the same machine chi-square and information are sums; a stray field counts by the rigidity, a magnet's error does not.

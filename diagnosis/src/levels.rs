@@ -16,6 +16,7 @@ use core::ops::Range;
 use nalgebra::DMatrix;
 use twin::{Measured, Unit};
 
+use super::median::upper_median;
 use inference::{Imperfection, Measure};
 
 /// Frames in which the noise of all monitors is larger.
@@ -292,9 +293,7 @@ fn dispersion(of_frame: &[Sums]) -> f64 {
         let expected = 2.0 / pair[0].count + 2.0 / pair[1].count;
         (pair[0].variance() / pair[1].variance()).ln().powi(2) / expected
     });
-    let mut differ: Vec<f64> = differ.collect();
-    differ.sort_by(f64::total_cmp);
-    differ.get(differ.len() / 2).map_or(1.0, |median| (median / MEDIAN).max(1.0))
+    upper_median(differ).map_or(1.0, |median| (median / MEDIAN).max(1.0))
 }
 
 #[cfg(test)]
@@ -302,9 +301,10 @@ mod tests {
     use nalgebra::DVector;
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal, StudentT};
+    use rand_distr::{Distribution, StudentT};
 
     use super::*;
+    use crate::testing::normal;
 
     const FRAMES: usize = 346;
     const MONITORS: usize = 30;
@@ -317,10 +317,6 @@ mod tests {
             if frame.is_multiple_of(3) { f64::NAN } else { noise(&mut random) * scale(frame, b) }
         };
         DMatrix::from_fn(FRAMES, MONITORS, of)
-    }
-
-    fn normal(random: &mut StdRng) -> f64 {
-        StandardNormal.sample(random)
     }
 
     #[test]

@@ -47,7 +47,7 @@ mod tests {
     use twin::Ring;
 
     use super::*;
-    use crate::scan::Rivals;
+    use crate::scan::expected;
 
     #[test]
     fn an_effect_at_its_limit_has_the_evidence_asked_for() {
@@ -64,8 +64,8 @@ mod tests {
         let limits = Limits::from_scan(EffectKind::BpmGain, &scanned).unwrap();
         assert!(limits.least < limits.median && limits.median < limits.at_most);
         for (candidate, (_, limit)) in scanned.iter().zip(at_places(EffectKind::BpmGain, &scanned)) {
-            let rivals = Rivals { power: candidate.power, rival: 0.0, both: 0.0, free: [true, false] };
-            let gain = rivals.expected(limit / EffectKind::BpmGain.prior_scale().unwrap());
+            let amplitude = limit / EffectKind::BpmGain.prior_scale().unwrap();
+            let gain = expected(amplitude, [candidate.power, 0.0, 0.0], [true, false]);
             // the limit is stated before the correction for the free amplitude
             assert!((gain + 0.5 * candidate.power.ln_1p() - SEEN).abs() < 1e-9, "{gain}");
         }

@@ -7,8 +7,7 @@
 use nalgebra::DVector;
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::hypothesis::Hypothesis;
 
 /// Most linearisations of a fit, and the chi-square of the change by one that calls for the next.
@@ -79,22 +78,28 @@ mod tests {
 
     use inference::{Campaign, Recording};
     use twin::{EffectKind, Ring};
-    use validation::{Cases, Class};
+    use validation::{Case, Cases, Class};
 
     use super::*;
     use crate::average::Vars;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
+
+    /// A case that is drawn beside the template, whose ring and recording come first.
+    fn drawn(class: Class, number: usize, seed: u64) -> (Ring, Recording, Case) {
+        let (ring, recording) = template();
+        let case = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap().draw(class, number, seed);
+        (ring, recording, case)
+    }
 
     /// A sextupole next to an integer tune, which the orbit passes some tenths of a millimetre off the estimated place: linearised on the estimated orbit, each pass
     /// went further away, and two effects were named that are not there.
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn readings_beside_a_sextupole_are_linearised_on_the_orbit_of_the_fit() {
-        let (ring, recording) = template();
-        let case = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap().draw(Class::Pair, 2_000_002, 4);
+        let (ring, recording, case) = drawn(Class::Pair, 2_000_002, 4);
         let sextupole = case.effects.iter().find(|effect| effect.kind == EffectKind::SextupoleError).unwrap();
         let made = case.recording(&ring, &recording).unwrap();
-        let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let mut data = whitened(&ring, &made);
         let hypothesis = Hypothesis::plain().with((*sextupole).into());
         let unknowns = data.units.len() + hypothesis.unknowns(&data).len();
         let fitted = fit(&mut data, &hypothesis, &DVector::zeros(unknowns)).unwrap();
@@ -113,7 +118,7 @@ mod tests {
         let recording = Recording::read(&folder, &ring).unwrap();
         let cases = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         let made = cases.draw(Class::Single, 1_000_015, 1).recording(&ring, &recording).unwrap();
-        let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let mut data = whitened(&ring, &made);
         let start = DVector::zeros(data.units.len());
         let fitted = fit(&mut data, &Hypothesis::plain(), &start).unwrap();
         let mut about = data.clone();
@@ -125,38 +130,24 @@ mod tests {
     }
 
     /// One reading of y_B5 that jumps by some mm and is the first of its setting made the fit poor, and a poor fit kept it: this machine was `unexplained`, with two
-    /// exchanged correctors and without.
-    #[test]
-    #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
-    fn a_jump_that_alone_makes_a_fit_poor_is_trimmed() {
-        let (ring, recording) = template();
-        let cases = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
-        let mut case = cases.draw(Class::Single, 1_000_199, 5);
-        case.effects.clear();
-        let made = case.recording(&ring, &recording).unwrap();
-        let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
-        let start = DVector::zeros(data.units.len());
-        assert!(Fitted::from_guess(&data, &Hypothesis::plain(), &start).unwrap().is_poor());
-        let fitted = fit(&mut data, &Hypothesis::plain(), &start).unwrap();
-        assert!(fitted.chi2_per_number() < 1.0, "{}", fitted.chi2_per_number());
-    }
-
-    /// The same of a monitor that is sound otherwise: 5 mm in all frames of one setting were a cause at its corrector that the library does not hold.
+    /// exchanged correctors and without. The same of a monitor that is sound otherwise: 5 mm in all frames of one setting were a cause at its corrector that the
+    /// library does not hold.
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn a_single_reading_that_is_far_off_is_trimmed() {
-        let (ring, recording) = template();
-        let cases = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
-        let mut made = cases.draw(Class::Empty, 3, 5).recording(&ring, &recording).unwrap();
-        let y_e7 = ring.monitor_names().iter().position(|name| name == "y_E7").unwrap();
-        made.rows[262..265].iter_mut().for_each(|row| row.reading[y_e7] = row.reading[y_e7].map(|y| y + 5e-3));
-        let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
-        let start = DVector::zeros(data.units.len());
-        let before = data.whole_size();
-        assert!(Fitted::from_guess(&data, &Hypothesis::plain(), &start).unwrap().is_poor());
-        let fitted = fit(&mut data, &Hypothesis::plain(), &start).unwrap();
-        assert!(fitted.chi2_per_number() < 1.0, "{}", fitted.chi2_per_number());
-        assert!(before - data.whole_size() < 4, "{before} {}", data.whole_size());
+        for (class, number, moved) in [(Class::Single, 1_000_199, 0.0), (Class::Empty, 3, 5e-3)] {
+            let (ring, recording, mut case) = drawn(class, number, 5);
+            case.effects.clear();
+            let mut made = case.recording(&ring, &recording).unwrap();
+            let y_e7 = ring.monitor_names().iter().position(|name| name == "y_E7").unwrap();
+            made.rows[262..265].iter_mut().for_each(|row| row.reading[y_e7] = row.reading[y_e7].map(|y| y + moved));
+            let mut data = whitened(&ring, &made);
+            let (start, before) = (DVector::zeros(data.units.len()), data.whole_size());
+            assert!(Fitted::from_guess(&data, &Hypothesis::plain(), &start).unwrap().is_poor());
+            let fitted = fit(&mut data, &Hypothesis::plain(), &start).unwrap();
+            assert!(fitted.chi2_per_number() < 1.0, "{}", fitted.chi2_per_number());
+            assert!(before - data.whole_size() < 4, "{before} {}", data.whole_size());
+        }
     }
 
     /// Drifts of 4 per mille, one of them of a machine with ordinary imperfections: the tunes then tell the vars more than the orbits do. With derivatives of
@@ -164,13 +155,11 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn a_large_drift_is_fitted_as_it_is_in_every_frame() {
-        let (ring, recording) = template();
-        let cases = Cases::of(&Campaign::of(&ring, &recording).unwrap()).unwrap();
         for (number, seed) in [(1_000_075, 5), (1_000_467, 2)] {
-            let case = cases.draw(Class::Single, number, seed);
+            let (ring, recording, case) = drawn(Class::Single, number, seed);
             let [drift] = case.effects[..] else { panic!("one effect") };
             let made = case.recording(&ring, &recording).unwrap();
-            let mut data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+            let mut data = whitened(&ring, &made);
             let hypothesis = Hypothesis::plain().with(drift.into());
             let start = DVector::zeros(data.units.len());
             let fitted = fit(&mut data, &hypothesis, &start).unwrap();

@@ -78,33 +78,6 @@ impl Location {
         }
     }
 
-    /// In two or three words.
-    pub fn short(&self, data: &Data) -> String {
-        let name = self.label(data);
-        match self {
-            Self::Monitor(_) => format!("monitor {name}"),
-            Self::MonitorInTime(_) => format!("monitor {name}, in time"),
-            Self::GainInTime(_) => format!("gain of {name} in time"),
-            Self::MonitorElsewhere(_) => format!("monitor {name}, other location"),
-            Self::MonitorCurve(_) => format!("curve of {name}"),
-            Self::Corrector(_) => format!("corrector {name}"),
-            Self::CorrectorElsewhere(_) => format!("corrector {name}, other location"),
-            Self::UnsteadyCorrector(_) => format!("corrector {name}, from frame to frame"),
-            Self::Ring(_, Plane::X) => format!("kicks near {name}, x"),
-            Self::Ring(_, Plane::Y) => format!("kicks near {name}, y"),
-            Self::RingInTime(_, Plane::X) => format!("kicks near {name} in time, x"),
-            Self::RingInTime(_, Plane::Y) => format!("kicks near {name} in time, y"),
-            Self::Linear(_, does) => format!("unknown element near {name}, {}", does.short()),
-            Self::QuadrupoleInTime(_) => format!("quadrupole {name}, in time"),
-            Self::QuadrupoleInRuns(_) => format!("quadrupole {name}, from setting to setting"),
-            Self::Time => "all monitors, in time".into(),
-            Self::Tunes => "tunes, in time".into(),
-            Self::Everywhere => "all monitors".into(),
-            Self::FirstFrames { .. } => format!("first frames of settings, {name}"),
-            Self::FrameToFrame => "all monitors, from frame to frame".into(),
-        }
-    }
-
     /// As a clause of the sentence.
     pub fn phrase(&self, data: &Data) -> String {
         let name = self.label(data);

@@ -7,14 +7,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-/// The modes of all frames.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Modes {
-    /// F: rows monitors, in units of their own noise.
-    pub factors: DMatrix<f64>,
-}
-
-/// Their whitening, frame by frame.
+/// The whitening of the modes of all frames, frame by frame.
 #[derive(Debug, Clone, Default)]
 pub struct Mixing {
     frames: Vec<Mixed>,
@@ -29,32 +22,22 @@ struct Mixed {
     shrink: DVector<f64>,
 }
 
-impl Modes {
-    /// None, of so many monitors.
-    pub(crate) fn none(monitors: usize) -> Self {
-        Self { factors: DMatrix::zeros(monitors, 0) }
-    }
-
-    /// True if monitors have nothing in common.
-    pub fn is_none(&self) -> bool {
-        self.factors.is_empty()
-    }
-}
-
 impl Mixing {
-    /// Over the readings that count in frames of which the noise has a level, rows frames.
-    pub fn from_modes(modes: &Modes, levels: &[f64], counts: impl Fn(usize, usize) -> bool) -> Self {
+    /// Of F, rows monitors, in units of their own noise, over the readings that count in frames of which the noise has a level, rows frames.
+    pub fn from_modes(modes: &DMatrix<f64>, levels: &[f64], counts: impl Fn(usize, usize) -> bool) -> Self {
         let mixed_in_frame = |(frame, level): (usize, &f64)| {
-            let mut factors = &modes.factors / *level;
+            let mut factors = modes / *level;
             for (b, mut row) in factors.row_iter_mut().enumerate() {
                 if !counts(frame, b) {
                     row.fill(0.0);
                 }
             }
-            Mixed::from_factors(factors)
+            let svd = factors.svd(true, false);
+            let shrink = svd.singular_values.map(|d| 1.0 - (1.0 + d * d).sqrt().recip());
+            Mixed { basis: svd.u.expect("asked for"), shrink }
         };
         Self {
-            frames: if modes.is_none() { Vec::new() } else { levels.iter().enumerate().map(mixed_in_frame).collect() },
+            frames: if modes.is_empty() { Vec::new() } else { levels.iter().enumerate().map(mixed_in_frame).collect() },
         }
     }
 
@@ -90,14 +73,6 @@ impl Mixing {
     }
 }
 
-impl Mixed {
-    fn from_factors(factors: DMatrix<f64>) -> Self {
-        let svd = factors.svd(true, false);
-        let shrink = svd.singular_values.map(|d| 1.0 - (1.0 + d * d).sqrt().recip());
-        Self { basis: svd.u.expect("asked for"), shrink }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -107,7 +82,7 @@ mod tests {
         let factors = DMatrix::from_row_slice(4, 2, &[0.5, 0.0, -0.7, 0.0, 0.3, 0.6, 0.9, 0.6]);
         let counts = |frame: usize, b: usize| frame == 0 || b != 1;
         let levels = [1.0, 3.0];
-        let mixing = Mixing::from_modes(&Modes { factors: factors.clone() }, &levels, counts);
+        let mixing = Mixing::from_modes(&factors, &levels, counts);
         let mut log_det = 0.0;
         for frame in 0..2 {
             let kept =

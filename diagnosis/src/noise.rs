@@ -11,29 +11,30 @@
 //! tails of Student's t with four degrees of freedom, but their chi-square would no longer be their number, and two repeats cannot tell which
 //! is the outlier.
 
+use core::ops::Range;
+
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
 use twin::{Measured, Unit};
 
+use super::columns::beside;
 use super::frame_pattern::{self, Found, FrameToFrame, Known, Like, Shape};
-use super::jitter::{CRATE, Crate, Differences, groups, with_column, with_crates};
+use super::jitter::{CRATE, Crate, Differences, groups, with_crates};
 use super::levels::{Levels, Part};
+use super::median::upper_median;
 use super::memory::Memory;
-use super::modes::Modes;
 use super::odds::{SUSPICIOUS, correction_of_sort};
 use super::period::Period;
 use super::repeats::{Repeats, Run};
 use super::scale::{ALIKE, QUOTED, Scales};
 use super::slow_noise::{SHARE, Slow, steps};
-use inference::Campaign;
-use inference::{Imperfection, Measure, POSITION};
+use super::transients::runs;
+use inference::{Campaign, Imperfection, Measure, POSITION};
 
 /// What was learnt of the noise. A value is 0 (a scale 1) where there is no sign of it; its error is then the root mean square that the
 /// recording allows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Noise {
-    /// Scale of the noise of each monitor over the header's [B] [1]; 1 for a faulty one.
-    pub scale: Vec<f64>,
     /// Scale that all have in common [1].
     pub common_scale: Measured,
     /// Scatter of the scales between monitors, relative [1].
@@ -46,14 +47,10 @@ pub struct Noise {
     pub momentum: Measured,
     /// Share of the noise's variance that the monitors of a crate have in common, the largest [1].
     pub crate_share: Measured,
-    /// The crates, where any were found.
-    pub crates: Vec<Crate>,
     /// What else moves all monitors from frame to frame, or a momentum that does so beyond what is ordinary.
     pub frame_to_frame: Option<FrameToFrame>,
     /// Monitors that the screening calls noisy only for what moves all of them, by index.
     pub sound: Vec<usize>,
-    /// Kurtosis of the differences, 3 for normal noise [1].
-    pub kurtosis: Measured,
     /// Noise of each monitor's readings that is its own [B] [m].
     pub own: Vec<f64>,
     /// Monitors that wander by themselves, by index, with the walk of each [m per root frame].
@@ -62,8 +59,8 @@ pub struct Noise {
     pub ordinary_walk: f64,
     /// Ordinary jitter of the momentum: the orbit's is that of the noise where the dispersion is largest [1].
     pub ordinary_momentum: f64,
-    /// Noise in common, in units of the monitors' own.
-    pub(super) modes: Modes,
+    /// Noise in common, in units of the monitors' own: rows monitors, columns modes.
+    pub(super) modes: DMatrix<f64>,
 }
 
 /// What noise is learnt from.
@@ -86,8 +83,6 @@ const FEWEST: f64 = 6.0;
 const NOISY: f64 = 1.5;
 /// Noisy monitors from which on it is likely that something moves all of them.
 const MANY: usize = 3;
-/// Kurtosis of normal noise.
-const NORMAL: f64 = 3.0;
 /// Least share of a reading's variance that is not the momentum's.
 const OWN: f64 = 0.01;
 
@@ -128,7 +123,7 @@ impl Shared {
     ) -> Self {
         let momentum = differences.momentum(per_momentum, ordinary(per_momentum), known);
         let jitter = per_momentum * momentum.value;
-        let (crates, one_more) = differences.crates(&with_column(known, &jitter), orders);
+        let (crates, one_more) = differences.crates(&beside(known.clone(), &jitter), orders);
         Self { momentum, jitter, crates, one_more }
     }
 
@@ -138,7 +133,7 @@ impl Shared {
         let none = DMatrix::zeros(self.jitter.len(), 0);
         let (each, choice) = (0.5 * (frames as f64).ln(), (groups(orders).len() as f64).ln());
         let mut all = vec![Known { modes: none.clone(), cost: 0.0 }];
-        let jitter = if self.momentum.value > 0.0 { with_column(&none, &self.jitter) } else { none };
+        let jitter = if self.momentum.value > 0.0 { beside(none, &self.jitter) } else { none };
         if self.momentum.value > 0.0 {
             all.push(Known { modes: jitter.clone(), cost: each });
         }
@@ -161,31 +156,27 @@ impl Noise {
         let monitors = campaign.monitors();
         let nothing = Measured { value: 0.0, sigma: 0.0 };
         Self {
-            scale: vec![1.0; monitors],
             common_scale: Measured { value: 1.0, sigma: 0.0 },
             scatter: nothing,
             levels: Levels::CONSTANT,
             slow: Slow::NONE,
             momentum: nothing,
             crate_share: nothing,
-            crates: Vec::new(),
             frame_to_frame: None,
             sound: Vec::new(),
-            kurtosis: Measured { value: NORMAL, sigma: 0.0 },
             own: (0..monitors).map(|b| campaign.noise(b)).collect(),
             wandering: Vec::new(),
             ordinary_walk: 0.0,
             ordinary_momentum: 0.0,
-            modes: Modes::none(monitors),
+            modes: DMatrix::zeros(monitors, 0),
         }
     }
 
     /// With the common scale as the screening weights the monitors, their median: where it calls all of them noisy nothing else is known.
     fn at_weights(self, campaign: &Campaign) -> Self {
         let header = &campaign.recording.header.noise;
-        let mut scales: Vec<f64> = self.own.iter().zip(header).map(|(own, header)| own / header).collect();
-        scales.sort_by(f64::total_cmp);
-        let value = scales.get(scales.len() / 2).copied().unwrap_or(1.0);
+        let scales = self.own.iter().zip(header).map(|(own, header)| own / header);
+        let value = upper_median(scales).unwrap_or(1.0);
         Self { common_scale: Measured { value, sigma: 0.0 }, ..self }
     }
 
@@ -254,7 +245,7 @@ impl Noise {
             let count = one.repeats.weigh(Memory::NONE).count;
             let value = (share_of_own.sqrt() * one.sigma / campaign.recording.header.noise[one.b]).ln();
             // the mean of `ln` of a sample's rms is below the true one by the variance of that
-            let variance = (kurtosis.value - 1.0) / (4.0 * count);
+            let variance = (kurtosis - 1.0) / (4.0 * count);
             Measured { value: value + variance, sigma: variance.sqrt() / share_of_own }
         };
         let mut scales = vec![None; campaign.monitors()];
@@ -270,7 +261,6 @@ impl Noise {
             momentum,
             crate_share: crates.iter().max_by(largest).map_or(one_more, |found| found.share),
             sound: sound.to_vec(),
-            kurtosis,
             ordinary_walk: steps(campaign.frames() as f64) * sigma.iter().sum::<f64>() / sigma.len() as f64,
             ..Self::screened(campaign)
         };
@@ -296,13 +286,13 @@ impl Noise {
         if square == 0.0 {
             return None;
         }
-        let runs = runs(&campaign.settings.repeatable);
+        let settings = &campaign.settings.repeatable;
         let mut residual = source.residual.clone();
         for (frame, mut row) in residual.row_iter_mut().enumerate() {
             let missing = (0..own.len()).filter(|&b| !campaign.counts(frame, b));
             missing.for_each(|b| row[b] = f64::NAN);
         }
-        let period = Period::find(&frame_pattern::amplitudes(moving, &residual, &own, &runs), &runs);
+        let period = Period::find(&frame_pattern::amplitudes(moving, &residual, &own, settings), &runs(settings));
         let of_period = period.map_or(f64::NEG_INFINITY, |one| frame_pattern::beyond_chance(one.log_chance));
         let log_bayes = match (like, &found) {
             (Like::Momentum, _) | (_, None) => {
@@ -364,7 +354,7 @@ impl Noise {
                 self.own[b] = (self.own[b].powi(2) - jitter * jitter).max(least * least).sqrt();
             }
         }
-        Self { scale, ..self }
+        self
     }
 
     /// Noise in common; what a crate shares is no longer its monitors' own.
@@ -378,7 +368,6 @@ impl Noise {
             }
             columns.push(column);
         }
-        self.crates = crates;
         if self.momentum.value > 0.0 {
             let pattern = DVector::from_fn(self.own.len(), |b, _| source.dispersion[b] / self.own[b]);
             columns.push(pattern * self.momentum.value);
@@ -389,7 +378,7 @@ impl Noise {
             columns.extend(one.patterns.column_iter().map(over));
         }
         if !columns.is_empty() {
-            self.modes = Modes { factors: DMatrix::from_columns(&columns) };
+            self.modes = DMatrix::from_columns(&columns);
         }
         self
     }
@@ -475,7 +464,8 @@ fn orders(campaign: &Campaign, learners: &[Learner]) -> [Vec<usize>; 2] {
 fn learners(source: &Source, sound: &[usize]) -> Vec<Learner> {
     let campaign = source.campaign;
     let settings = &campaign.settings.repeatable;
-    let apart: Vec<Option<usize>> = runs(settings).into_iter().map(Some).collect();
+    let number = |(i, run): (usize, Range<usize>)| run.map(move |_| Some(i));
+    let apart: Vec<Option<usize>> = runs(settings).into_iter().enumerate().flat_map(number).collect();
     let (runs, apart) = (Run::from_settings(settings), Run::from_settings(&apart));
     let learner = |b: usize| {
         let frames: Vec<usize> = (0..campaign.frames()).filter(|&frame| campaign.counts(frame, b)).collect();
@@ -509,22 +499,12 @@ fn differences(
     all
 }
 
-/// The run of consecutive frames of one setting that each frame is in.
-fn runs(settings: &[Option<usize>]) -> Vec<usize> {
-    let mut run = 0;
-    let run_of_frame = |i: usize| {
-        run += usize::from(i > 0 && (settings[i].is_none() || settings[i] != settings[i - 1]));
-        run
-    };
-    (0..settings.len()).map(run_of_frame).collect()
-}
-
-/// Of differences of variance 1, with its sampling error for normal noise.
-fn kurtosis(differences: &DMatrix<f64>) -> Measured {
+/// Kurtosis of differences, 3 for normal noise [1].
+fn kurtosis(differences: &DMatrix<f64>) -> f64 {
     let known: Vec<f64> = differences.iter().copied().filter(|z| !z.is_nan()).collect();
     let n = known.len().max(1) as f64;
     let moment = |power: i32| known.iter().map(|z| z.powi(power)).sum::<f64>() / n;
-    Measured { value: (moment(4) / moment(2).powi(2)).max(1.0 + 1.0 / n), sigma: (24.0 / n).sqrt() }
+    (moment(4) / moment(2).powi(2)).max(1.0 + 1.0 / n)
 }
 
 #[cfg(test)]
@@ -537,7 +517,7 @@ mod tests {
     use super::*;
     use crate::Diagnosis;
     use crate::data::Data;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, template, whitened};
     use crate::verdict::Verdict;
 
     /// What is learnt of a campaign, and what is true of it: scale, slow share, its time, walk, jitter, crate's share.
@@ -575,7 +555,7 @@ mod tests {
         for seed in 0..2 {
             for truth in kinds(|| Coloured::white(&ring, &recording, 100 + seed)) {
                 let made = truth.campaign(&ring, &recording, &[]);
-                let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+                let data = whitened(&ring, &made);
                 for (name, found, truth) in learnt(&data.noise, &truth, recording.header.noise[0]) {
                     println!("{seed} {name}: {:.3e} ± {:.1e}, true {truth:.3e}", found.value, found.sigma);
                     assert!((found.value - truth).abs() <= 3.0 * found.sigma + 1e-12, "{name}");
@@ -592,10 +572,9 @@ mod tests {
             let made = Coloured::white(&ring, &recording, 40 + seed).campaign(&ring, &recording, &[]);
             let campaign = Campaign::of(&ring, &made).unwrap();
             let data = Data::from_campaign(&campaign).unwrap();
-            let Noise { levels, slow, wandering, modes, scale, .. } = &data.noise;
-            let is_ordinary = slow.is_none() && wandering.is_empty() && modes.is_none();
-            let is_of_header = levels.is_constant() && scale.iter().all(|scale| *scale == 1.0);
-            assert!(is_ordinary && is_of_header, "{:?}", data.noise);
+            let Noise { levels, slow, wandering, modes, .. } = &data.noise;
+            let is_ordinary = slow.is_none() && wandering.is_empty() && modes.is_empty();
+            assert!(is_ordinary && levels.is_constant(), "{:?}", data.noise);
             (0..campaign.monitors()).for_each(|b| assert_eq!(data.noise.own[b], campaign.noise(b), "monitor {b}"));
         }
     }
@@ -643,8 +622,7 @@ mod tests {
         let (ring, recording) = template();
         let (part, factor) = (150..220, 4.0_f64);
         let white = Coloured::white(&ring, &recording, 71);
-        let sound =
-            Data::from_campaign(&Campaign::of(&ring, &white.campaign(&ring, &recording, &[])).unwrap()).unwrap();
+        let sound = whitened(&ring, &white.campaign(&ring, &recording, &[]));
         let mut random = StdRng::seed_from_u64(72);
         let more = Normal::new(0.0, white.noise * (factor * factor - 1.0).sqrt()).unwrap();
         let in_part = |frame: usize, _| if part.contains(&frame) { more.sample(&mut random) } else { 0.0 };
@@ -676,7 +654,7 @@ mod tests {
             .for_each(|row| row.reading[jumping] = row.reading[jumping].map(|x| x + 8e-3));
         let value = made.rows[180].reading[stuck];
         made.rows[181..200].iter_mut().for_each(|row| row.reading[stuck] = value);
-        let data = Data::from_campaign(&Campaign::of(&ring, &made).unwrap()).unwrap();
+        let data = whitened(&ring, &made);
         assert_eq!(data.health()[jumping].state, MonitorState::Jumps);
         assert!((184..200).all(|frame| data.is_aside(frame, stuck)), "a value that repeats is no reading");
     }

@@ -21,9 +21,9 @@ pub const UNMODELLED: f64 = 0.15;
 /// as likely as before where nothing is found, on average of 1186 simulated empty campaigns.
 pub const TOO_SMALL: f64 = 0.4;
 /// Prior probability of what can be seen of it.
-pub const UNMODELLED_SEEN: f64 = (1.0 - TOO_SMALL) * UNMODELLED;
+const UNMODELLED_SEEN: f64 = (1.0 - TOO_SMALL) * UNMODELLED;
 /// Number of sorts of location that compete with each other, equally likely a priori.
-pub const SORTS: usize = 15;
+const SORTS: usize = 15;
 
 /// Prior odds of one more beside some effects.
 pub fn odds_beside(effects: usize) -> f64 {
@@ -45,5 +45,10 @@ pub fn corrections(terms: &[Term]) -> Vec<f64> {
 
 /// The same for one sort of unmodelled discrepancy that has no sites.
 pub fn correction_of_sort() -> f64 {
-    -(UNMODELLED_SEEN * ODDS / SORTS as f64).ln()
+    -log_prior_unmodelled(ODDS, 1)
+}
+
+/// `ln` prior odds of an unmodelled discrepancy at one of some sites over none, by those of one (more) cause.
+pub fn log_prior_unmodelled(odds: f64, sites: usize) -> f64 {
+    (UNMODELLED_SEEN * odds / (SORTS * sites) as f64).ln()
 }

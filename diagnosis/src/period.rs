@@ -12,8 +12,11 @@
 //! Source: M. Zechmeister and M. Kürster, Astron. Astrophys. 496 (2009) 577, the generalised Lomb-Scargle periodogram.
 
 use core::f64::consts::TAU;
+use core::ops::Range;
 
 use nalgebra::DVector;
+
+use super::data::following;
 
 /// What recurs.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -47,12 +50,12 @@ const ROUNDING: f64 = 1e-6;
 /// Frames that have an amplitude, in groups with a mean of their own.
 struct Grouped {
     frames: Vec<usize>,
-    groups: Vec<Vec<usize>>,
+    groups: Vec<Range<usize>>,
 }
 
 impl Period {
     /// Of amplitudes, not a number where there is none, of frames in some runs.
-    pub fn find(amplitudes: &[f64], runs: &[usize]) -> Option<Self> {
+    pub fn find(amplitudes: &[f64], runs: &[Range<usize>]) -> Option<Self> {
         let grouped = Grouped::by_run(amplitudes, runs);
         let freedom = grouped.frames.len() as f64 - grouped.groups.len() as f64;
         if freedom < FEWEST {
@@ -79,24 +82,18 @@ impl Period {
 }
 
 impl Grouped {
-    fn by_run(amplitudes: &[f64], runs: &[usize]) -> Self {
-        let frames: Vec<usize> = (0..amplitudes.len()).filter(|&frame| !amplitudes[frame].is_nan()).collect();
-        let mut groups: Vec<Vec<usize>> = Vec::new();
-        for (i, &frame) in frames.iter().enumerate() {
-            match groups.last_mut().filter(|_| i > 0 && runs[frames[i - 1]] == runs[frame]) {
-                Some(group) => group.push(i),
-                None => groups.push(vec![i]),
-            }
-        }
-        Self { frames, groups }
+    fn by_run(amplitudes: &[f64], runs: &[Range<usize>]) -> Self {
+        let known = |run: &Range<usize>| run.clone().filter(|&frame| !amplitudes[frame].is_nan()).collect();
+        let known: Vec<Vec<usize>> = runs.iter().map(known).filter(|frames: &Vec<usize>| !frames.is_empty()).collect();
+        Self { groups: following(known.iter().map(Vec::len)), frames: known.concat() }
     }
 
     /// Values less the means of their groups.
     fn column(&self, value: impl Fn(usize) -> f64) -> DVector<f64> {
         let mut column = DVector::from_iterator(self.frames.len(), self.frames.iter().map(|&frame| value(frame)));
         for group in &self.groups {
-            let mean = group.iter().map(|&i| column[i]).sum::<f64>() / group.len() as f64;
-            group.iter().for_each(|&i| column[i] -= mean);
+            let mean = group.clone().map(|i| column[i]).sum::<f64>() / group.len() as f64;
+            group.clone().for_each(|i| column[i] -= mean);
         }
         column
     }
@@ -141,19 +138,18 @@ fn explained(values: &DVector<f64>, columns: Vec<DVector<f64>>) -> f64 {
 mod tests {
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
+    use crate::testing::normal;
 
     const FRAMES: usize = 346;
 
     /// Runs of three frames, and noise of variance 1 with a mean of its own in each run.
-    fn noise(seed: u64) -> (Vec<f64>, Vec<usize>) {
+    fn noise(seed: u64) -> (Vec<f64>, Vec<Range<usize>>) {
         let mut random = StdRng::seed_from_u64(seed);
-        let runs: Vec<usize> = (0..FRAMES).map(|frame| frame / 3).collect();
-        let white = |random: &mut StdRng| -> f64 { StandardNormal.sample(random) };
-        let mean: Vec<f64> = (0..=FRAMES / 3).map(|_| 5.0 * white(&mut random)).collect();
-        (runs.iter().map(|&run| mean[run] + white(&mut random)).collect(), runs)
+        let runs = (0..FRAMES).step_by(3).map(|start| start..FRAMES.min(start + 3)).collect();
+        let mean: Vec<f64> = (0..=FRAMES / 3).map(|_| 5.0 * normal(&mut random)).collect();
+        ((0..FRAMES).map(|frame| mean[frame / 3] + normal(&mut random)).collect(), runs)
     }
 
     #[test]

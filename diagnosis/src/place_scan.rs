@@ -9,8 +9,7 @@ use core::convert::Infallible;
 use twin::{Place, Thin};
 
 use super::data::Data;
-use super::error::FitError;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::scan::{BATCH, Projection, SignatureScore, of_each};
 
 /// Longest segment [m], and longest where the gradient may be.
@@ -28,6 +27,10 @@ pub struct Segment {
     pub s: f64,
     /// Its length [m].
     pub length: f64,
+    /// `ln` Bayes factor over none.
+    pub log_bayes: f64,
+    /// Most likely amplitude [1/m].
+    pub amplitude: f64,
     place: Place,
 }
 
@@ -47,10 +50,6 @@ pub struct PlaceScan {
     pub kind: Thin,
     /// Where, along the beam.
     pub segments: Vec<Segment>,
-    /// `ln` Bayes factor over none, at each.
-    pub log_bayes: Vec<f64>,
-    /// Most likely amplitude at each [1/m].
-    pub amplitude: Vec<f64>,
 }
 
 impl PlaceScan {
@@ -76,12 +75,14 @@ impl PlaceScan {
                     own.signatures::<Infallible>(into, batch.iter().map(signature))
                 });
                 let Ok(columns) = columns;
-                projection.score(&columns).scores
+                projection.score(&columns).0
             };
             let scores: Vec<SignatureScore> = segments.chunks(BATCH).flat_map(of_batch).collect();
-            let judged = scores.into_iter().map(SignatureScore::of_amplitude);
-            let (amplitude, log_bayes) = judged.map(|(amplitude, log_bayes)| (amplitude * scale, log_bayes)).unzip();
-            Self { kind, segments, log_bayes, amplitude }
+            let judged = |(segment, score): (Segment, SignatureScore)| {
+                let (amplitude, log_bayes) = score.judged(false);
+                Segment { log_bayes, amplitude: amplitude * scale, ..segment }
+            };
+            Self { kind, segments: segments.into_iter().zip(scores).map(judged).collect() }
         };
         let coarse = judge(segments(data));
         let finer = judge(coarse.likely().flat_map(|i| coarse.segments[i].split()).collect());
@@ -90,39 +91,33 @@ impl PlaceScan {
 
     /// Cells that are not far behind the first.
     fn likely(&self) -> impl Iterator<Item = usize> + '_ {
-        let first = self.log_bayes[self.peak()];
+        let first = self.segments[self.peak()].log_bayes;
         let limit = first - BEHIND.min(BEHIND_SHARE * first.abs());
-        (0..self.segments.len()).filter(move |&i| self.log_bayes[i] > limit)
+        (0..self.segments.len()).filter(move |&i| self.segments[i].log_bayes > limit)
     }
 
     /// The same with the likely segments replaced by finer ones.
     fn with(&self, finer: Self) -> Self {
         let likely: Vec<usize> = self.likely().collect();
         let kept = (0..self.segments.len()).filter(|i| !likely.contains(i));
-        let segment = |one: &Self, i: usize| (one.segments[i], one.log_bayes[i], one.amplitude[i]);
-        let mut all: Vec<_> = kept.map(|i| segment(self, i)).collect();
-        all.extend((0..finer.segments.len()).map(|i| segment(&finer, i)));
-        all.sort_by(|one, other| one.0.s.total_cmp(&other.0.s));
-        let mut joined = Self { segments: Vec::new(), log_bayes: Vec::new(), amplitude: Vec::new(), ..finer };
-        for (segment, log_bayes, amplitude) in all {
-            joined.segments.push(segment);
-            joined.log_bayes.push(log_bayes);
-            joined.amplitude.push(amplitude);
-        }
-        joined
+        let mut segments: Vec<Segment> = kept.map(|i| self.segments[i]).chain(finer.segments).collect();
+        segments.sort_by(|one, other| one.s.total_cmp(&other.s));
+        Self { segments, ..*self }
     }
 
     /// The most likely segment.
     pub fn peak(&self) -> usize {
-        (0..self.segments.len()).max_by(|&i, &j| self.log_bayes[i].total_cmp(&self.log_bayes[j])).unwrap_or(0)
+        let log_bayes = |i: usize| self.segments[i].log_bayes;
+        (0..self.segments.len()).max_by(|&i, &j| log_bayes(i).total_cmp(&log_bayes(j))).unwrap_or(0)
     }
 
     /// The shortest stretches of the ring that hold a share of the posterior, in beam order.
     pub fn credible(&self, share: f64) -> Vec<Interval> {
-        let largest = self.log_bayes[self.peak()];
-        let weight = |i: usize| (self.log_bayes[i] - largest).exp() * self.segments[i].length;
+        let log_bayes = |i: usize| self.segments[i].log_bayes;
+        let largest = log_bayes(self.peak());
+        let weight = |i: usize| (log_bayes(i) - largest).exp() * self.segments[i].length;
         let mut order: Vec<usize> = (0..self.segments.len()).collect();
-        order.sort_by(|&i, &j| self.log_bayes[j].total_cmp(&self.log_bayes[i]));
+        order.sort_by(|&i, &j| log_bayes(j).total_cmp(&log_bayes(i)));
         let wanted = share * order.iter().map(|&i| weight(i)).sum::<f64>();
         let (mut held, mut inside) = (0.0, vec![false; order.len()]);
         for i in order {
@@ -167,13 +162,14 @@ fn segments(data: &Data) -> Vec<Segment> {
     elements.flat_map(|(at, element)| cut(at, element.s, 0.0, element.length, STEP)).collect()
 }
 
-/// Equal pieces, at most so long, of a part of an element that begins at `s`, `depth` from its entrance.
+/// Equal pieces, at most so long and not judged yet, of a part of an element that begins at `s`, `depth` from its entrance.
 fn cut(element: usize, s: f64, depth: f64, length: f64, step: f64) -> Vec<Segment> {
     let count = (length / step).ceil().max(1.0);
     let piece = length / count;
     let interval = |i: usize| {
         let middle = (i as f64 + 0.5) * piece;
-        Segment { s: s + middle, length: piece, place: Place { element, depth: depth + middle } }
+        let place = Place { element, depth: depth + middle };
+        Segment { s: s + middle, length: piece, log_bayes: 0.0, amplitude: 0.0, place }
     };
     (0..count as usize).map(interval).collect()
 }
@@ -184,39 +180,32 @@ mod tests {
 
     use super::*;
     use crate::hypothesis::Hypothesis;
-    use crate::testing::template;
-    use inference::simulate::{Hardware, Truth, campaign};
+    use crate::testing::{simulated, template, whitened};
     use twin::Effect;
 
     #[test]
     fn the_scan_peaks_where_the_gradient_is() {
-        let (ring, recording) = template();
-        let hardware = Hardware::shipped(&ring, &recording);
+        let ring = template().0;
         // the vars of its neighbours imitate a normal gradient: it has to be larger, and its place is less certain
         let cases = [(Thin::Normal, "SLOT_C6", 0.08, 12.0), (Thin::Skew, "SLOT_E3", 0.01, 4.0)];
         for (thin, place, amplitude, widest) in cases {
             let effect = Effect::at(thin.kind(), place, amplitude, &ring).unwrap();
-            let truth = Truth { vars: &[1.0; 48], effects: core::slice::from_ref(&effect), ..Truth::default() };
-            let made = campaign(&recording, &ring, &truth, &hardware, 7).unwrap();
-            let mut data = Data::from_campaign(&inference::Campaign::of(&ring, &made).unwrap()).unwrap();
+            let mut data = whitened(&ring, &simulated(&[1.0; 48], &[effect], &[], 7));
             let hypothesis = Hypothesis { terms: vec![effect.into()], ..Hypothesis::default() };
             let fitted = Fitted::from_guess(&data, &hypothesis, &DVector::zeros(48)).unwrap();
-            let (machine, drives) = fitted.machine(&data).unwrap();
+            let (machine, drives) = fitted.machine(&data, 0).unwrap();
             data.linearise_about(&machine, &drives.orbit).unwrap();
             let fitted = Fitted::from_guess(&data, &hypothesis, &fitted.u).unwrap();
             let scan = PlaceScan::from_fit(&data, &fitted, Some(0), thin).unwrap();
             let truth = ring.elements[ring.element(place).unwrap()].s;
-            let peak = scan.peak();
+            let peak = scan.segments[scan.peak()];
             let credible = scan.credible(0.95);
             let width: f64 = credible.iter().map(|one| one.to_m - one.from_m).sum();
-            println!(
-                "{place} s {truth:.2}: peak {:.2}, {width:.2} m, {:.4} /m",
-                scan.segments[peak].s, scan.amplitude[peak]
-            );
+            println!("{place} s {truth:.2}: peak {:.2}, {width:.2} m, {:.4} /m", peak.s, peak.amplitude);
             assert!(credible.iter().any(|one| (one.from_m - 1.0..one.to_m + 1.0).contains(&truth)), "{credible:?}");
             assert!(width < widest, "{credible:?}");
             // some three standard deviations
-            assert!((scan.amplitude[peak] - amplitude).abs() < 0.3 * amplitude, "{}", scan.amplitude[peak]);
+            assert!((peak.amplitude - amplitude).abs() < 0.3 * amplitude, "{}", peak.amplitude);
             let whole: f64 = scan.segments.iter().map(|segment| segment.length).sum();
             assert!((whole - ring.circumference).abs() < 1e-6, "{whole}");
         }
@@ -225,9 +214,9 @@ mod tests {
     #[test]
     fn a_stretch_may_cross_the_start_of_the_ring() {
         let place = Place { element: 0, depth: 0.0 };
-        let segments: Vec<Segment> = (0..10).map(|i| Segment { s: i as f64 + 0.5, length: 1.0, place }).collect();
-        let log_bayes = (0..10).map(|i| if [0, 1, 9].contains(&i) { 0.0 } else { -50.0 }).collect();
-        let scan = PlaceScan { kind: Thin::Normal, segments, log_bayes, amplitude: vec![0.0; 10] };
+        let log_bayes = |i: usize| if [0, 1, 9].contains(&i) { 0.0 } else { -50.0 };
+        let segment = |i| Segment { s: i as f64 + 0.5, length: 1.0, log_bayes: log_bayes(i), amplitude: 0.0, place };
+        let scan = PlaceScan { kind: Thin::Normal, segments: (0..10).map(segment).collect() };
         assert_eq!(scan.credible(0.95), [Interval { from_m: 9.0, to_m: 2.0 }]);
     }
 }

@@ -74,11 +74,6 @@ impl Pools {
             ..drives.clone()
         }
     }
-
-    /// Rows of pools as those of their frames.
-    pub(crate) fn by_frame(&self, of_pools: &DMatrix<f64>) -> DMatrix<f64> {
-        of_pools.select_rows(&self.of_frame)
-    }
 }
 
 #[cfg(test)]

@@ -5,77 +5,46 @@
 //! it is off in these frames; in the others, with the median of itself. What lies more than half of the largest setting away contradicts: that is
 //! halfway between a corrector that is set and one that is not.
 
-use core::fmt;
-
-use inference::recording::Recording;
+use super::median::upper_median;
+use inference::recording::{Recording, Row};
 
 /// Share of a corrector's largest setting that separates set from not set.
 const HALF: f64 = 0.5;
 /// Frames that are named.
 const NAMED: usize = 3;
 
-/// A corrector whose read-back is another than its setting in some frames.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Contradiction {
-    /// The recording.
-    pub recording: String,
-    /// Name of the corrector.
-    pub corrector: String,
-    /// The frames, counted from 0.
-    pub frames: Vec<usize>,
-    /// Largest difference [A].
-    pub largest: f64,
-}
-
-impl Contradiction {
-    /// Those of a recording, by corrector; `names` of its correctors.
-    pub fn all(recording: &Recording, names: &[String]) -> Vec<Self> {
-        (0..names.len()).filter_map(|c| Self::find(recording, c, &names[c])).collect()
-    }
-
-    fn find(recording: &Recording, corrector: usize, name: &str) -> Option<Self> {
-        let off = |row: &inference::recording::Row| {
-            row.corrector_current[corrector] - row.setting(corrector).unwrap_or_default()
-        };
-        let settings = recording.rows.iter().filter_map(|row| row.setting(corrector));
-        let amplitude = settings.fold(0.0, |largest: f64, setting| largest.max(setting.abs()));
-        if amplitude == 0.0 {
-            return None;
-        }
-        let usual = [true, false].map(|is_set| {
-            let alike = recording.rows.iter().filter(|row| row.setting(corrector).is_some() == is_set);
-            median(alike.map(off).collect())
-        });
-        let differences = recording.rows.iter().map(|row| {
-            let [set, idle] = usual;
-            (off(row) - if row.setting(corrector).is_some() { set } else { idle }).abs()
-        });
-        let (frames, sizes): (Vec<usize>, Vec<f64>) =
-            differences.enumerate().filter(|(_, size)| *size > HALF * amplitude).unzip();
+/// Names the correctors of a recording whose read-back is another than their setting in some frames, counted from 0; `names` of its correctors.
+pub fn contradictions(recording: &Recording, names: &[String]) -> Vec<String> {
+    let said = |(c, corrector): (usize, &String)| {
+        let (frames, sizes): (Vec<usize>, Vec<f64>) = contradicting(recording, c).into_iter().unzip();
         let largest = sizes.iter().copied().fold(0.0, f64::max);
-        let (recording, corrector) = (recording.name.clone(), name.to_owned());
-        (!frames.is_empty()).then_some(Self { recording, corrector, frames, largest })
-    }
-}
-
-impl fmt::Display for Contradiction {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { corrector, frames, largest, .. } = self;
         let named: Vec<String> = frames.iter().take(NAMED).map(usize::to_string).collect();
         let more = if frames.len() > NAMED { ", ..." } else { "" };
         let plural = if frames.len() == 1 { "" } else { "s" };
         let (count, named) = (frames.len(), named.join(", "));
-        write!(
-            f,
-            "the read-back of corrector {corrector} contradicts its setting in {count} frame{plural} ({named}{more}), by up to {largest:.1} A"
-        )
-    }
+        (count > 0).then(|| {
+            format!(
+                "the read-back of corrector {corrector} contradicts its setting in {count} frame{plural} ({named}{more}), by up to {largest:.1} A"
+            )
+        })
+    };
+    names.iter().enumerate().filter_map(said).collect()
 }
 
-/// Median, 0 of none.
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
+/// The frames in which the read-back of a corrector contradicts its setting, and by how much [A].
+fn contradicting(recording: &Recording, corrector: usize) -> Vec<(usize, f64)> {
+    let off = |row: &Row| row.corrector_current[corrector] - row.setting(corrector).unwrap_or_default();
+    let settings = recording.rows.iter().filter_map(|row| row.setting(corrector));
+    let amplitude = settings.fold(0.0, |largest: f64, setting| largest.max(setting.abs()));
+    if amplitude == 0.0 {
+        return Vec::new();
+    }
+    let [set, idle] = [true, false].map(|is_set| {
+        let alike = recording.rows.iter().filter(|row| row.setting(corrector).is_some() == is_set);
+        upper_median(alike.map(off)).unwrap_or_default()
+    });
+    let size = |row: &Row| (off(row) - if row.setting(corrector).is_some() { set } else { idle }).abs();
+    recording.rows.iter().map(size).enumerate().filter(|(_, size)| *size > HALF * amplitude).collect()
 }
 
 #[cfg(test)]
@@ -87,20 +56,21 @@ mod tests {
     fn a_read_back_of_the_frame_before_contradicts_where_the_setting_changes() {
         let (ring, mut recording) = template();
         let names = ring.corrector_names();
-        assert_eq!(Contradiction::all(&recording, &names), []);
+        assert!(contradictions(&recording, &names).is_empty());
         // off by a constant is no contradiction
         recording.rows.iter_mut().for_each(|row| row.corrector_current[7] += 30.0);
-        assert_eq!(Contradiction::all(&recording, &names), []);
+        assert!(contradictions(&recording, &names).is_empty());
         let late = 9;
-        let current = |row: &inference::recording::Row| row.setting(late).unwrap_or_default();
+        let current = |row: &Row| row.setting(late).unwrap_or_default();
         let settings: Vec<f64> = recording.rows.iter().map(current).collect();
         let changes: Vec<usize> = (1..settings.len()).filter(|&i| settings[i] != settings[i - 1]).collect();
         for i in (1..settings.len()).rev() {
             recording.rows[i].corrector_current[late] = recording.rows[i - 1].corrector_current[late];
         }
-        let found = Contradiction::all(&recording, &names);
-        assert_eq!((found.len(), &found[0].corrector), (1, &names[late]));
+        let found = contradictions(&recording, &names);
+        assert!(found.len() == 1 && found[0].contains(&names[late]), "{found:?}");
         assert!(!changes.is_empty());
-        assert_eq!(found[0].frames, changes, "{}", found[0]);
+        let frames: Vec<usize> = contradicting(&recording, late).into_iter().map(|(frame, _)| frame).collect();
+        assert_eq!(frames, changes, "{}", found[0]);
     }
 }

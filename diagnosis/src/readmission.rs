@@ -8,6 +8,7 @@
 use estimator::MonitorState;
 use inference::{Campaign, Exclusions, Screened};
 
+use super::median::upper_median;
 use super::noise::{Noise, Source};
 
 /// Standard deviations of the noise within which a reading is taken back, where the level is larger and where it is ordinary: there a small jump is
@@ -69,9 +70,7 @@ fn ordinary_noise(campaign: &Campaign, noise: &Noise, b: usize) -> f64 {
 /// Median of what a monitor's readings that count leave, not a number without any.
 fn middle(source: &Source, b: usize) -> f64 {
     let frames = (0..source.campaign.frames()).filter(|&frame| source.campaign.counts(frame, b));
-    let mut values: Vec<f64> = frames.map(|frame| source.residual[(frame, b)]).collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+    upper_median(frames.map(|frame| source.residual[(frame, b)])).unwrap_or(f64::NAN)
 }
 
 /// True for a reading that is the same as the one before or after.

@@ -107,7 +107,7 @@ impl Repeats {
     /// orbit follows the supplies by unknown factors. `sigma`: noise [m].
     #[must_use]
     pub fn without(mut self, following: &DMatrix<f64>, sigma: f64) -> Self {
-        let mut values = DMatrix::from_fn(self.len(), 1, |i, _| self.readings[i].value);
+        let mut values = DMatrix::from_fn(self.readings.len(), 1, |i, _| self.readings[i].value);
         let mut known = following.clone();
         self.centre(&mut values);
         self.centre(&mut known);
@@ -155,11 +155,6 @@ impl Repeats {
         let squares: Vec<f64> =
             self.readings.windows(2).filter(repeated).map(|pair| (pair[1].value - pair[0].value).powi(2)).collect();
         (squares.len() >= FEW).then(|| (0.5 * squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
-    }
-
-    /// Number of readings.
-    pub fn len(&self) -> usize {
-        self.readings.len()
     }
 
     /// Each difference, with its frame: `(innovation, variance)`, the latter in units of the noise's.

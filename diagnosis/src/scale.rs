@@ -9,6 +9,7 @@
 use twin::Measured;
 
 use super::half_normal::HalfNormal;
+use super::median::upper_median;
 
 /// Scales of the monitors.
 #[derive(Debug, Clone, PartialEq)]
@@ -128,9 +129,7 @@ fn by_chance(one: &Measured, down: bool) -> f64 {
 
 /// Their median.
 fn centre_of(all: &[Measured]) -> f64 {
-    let mut values: Vec<f64> = all.iter().map(|one| one.value).collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
+    upper_median(all.iter().map(|one| one.value)).unwrap_or(0.0)
 }
 
 #[cfg(test)]

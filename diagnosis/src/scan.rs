@@ -14,9 +14,8 @@ use nalgebra::{DMatrix, DVector, DVectorView};
 use twin::{Drives, EffectKind, Machine, Signatures, Site};
 
 use super::data::Data;
-use super::error::FitError;
 use super::family::members;
-use super::fit::Fitted;
+use super::fit::{FitError, Fitted};
 use super::term::Term;
 
 /// One candidate.
@@ -60,14 +59,6 @@ pub struct SignatureScore {
     pub power: f64,
 }
 
-/// Scores of some signatures, and the fit's unknowns that absorb each.
-pub struct Scored {
-    /// One for each.
-    pub scores: Vec<SignatureScore>,
-    /// Rows unknowns, columns signatures.
-    pub taken: DMatrix<f64>,
-}
-
 impl Projection {
     /// About a fit at its best.
     pub fn from_fit(fitted: &Fitted) -> Self {
@@ -80,9 +71,6 @@ impl Projection {
     }
 
     /// About the same point without one of its unknowns: the residuals are those with it at zero.
-    ///
-    /// # Errors
-    /// [`FitError::Degenerate`].
     pub fn without(fitted: &Fitted, unknown: usize) -> Result<Self, FitError> {
         let residual = &fitted.residual + fitted.jacobian.column(unknown) * fitted.u[unknown];
         let back = fitted.jacobian.transpose().remove_row(unknown);
@@ -111,11 +99,11 @@ impl Projection {
         let bounds = self.bounds(columns);
         let is_hopeless = |i: usize| terms[i].is_exchange() && bounds[i].is_below_half_of_least();
         let (hopeless, scored): (Vec<usize>, Vec<usize>) = (0..terms.len()).partition(|&i| is_hopeless(i));
-        let Scored { scores, taken } = self.score(&columns.select_columns(&scored));
+        let (scores, taken) = self.score(&columns.select_columns(&scored));
         let mut candidates = vec![None; terms.len()];
         let candidate = |i: usize, score: SignatureScore, adapting: DVector<f64>| {
             let term = terms[i];
-            let (amplitude, log_bayes) = if term.kind.is_switch() { score.of_switch() } else { score.of_amplitude() };
+            let (amplitude, log_bayes) = score.judged(term.kind.is_switch());
             Some(Candidate { term, amplitude, log_bayes, power: score.power, adapting })
         };
         for (at, (&i, &score)) in scored.iter().zip(&scores).enumerate() {
@@ -133,8 +121,8 @@ impl Projection {
         gram(columns) - gram(&self.factor.whiten(&shared))
     }
 
-    /// Score whitened signatures, one a column, in units of their prior standard deviations.
-    pub fn score(&self, columns: &DMatrix<f64>) -> Scored {
+    /// Score whitened signatures, one a column, in units of their prior standard deviations; and the fit's unknowns that absorb each, rows unknowns.
+    pub fn score(&self, columns: &DMatrix<f64>) -> (Vec<SignatureScore>, DMatrix<f64>) {
         let shared = &self.back * columns;
         let taken = self.factor.solve(&shared);
         let score = |i: usize| {
@@ -142,7 +130,7 @@ impl Projection {
             let pull = column.dot(&self.residual) - taken.dot(&self.slope);
             SignatureScore { pull, power: (column.norm_squared() - taken.dot(&shared.column(i))).max(0.0) }
         };
-        Scored { scores: (0..columns.ncols()).map(score).collect(), taken }
+        ((0..columns.ncols()).map(score).collect(), taken)
     }
 }
 
@@ -157,20 +145,13 @@ impl SignatureScore {
         self.pull < 0.5 * self.least()
     }
 
-    /// Amplitude in prior standard deviations and `ln` Bayes factor, the amplitude free.
-    pub(crate) fn of_amplitude(self) -> (f64, f64) {
+    /// Amplitude in prior standard deviations and `ln` Bayes factor; a switch has no amplitude but 1.
+    pub fn judged(self, is_switch: bool) -> (f64, f64) {
+        if is_switch {
+            return (1.0, self.pull - 0.5 * self.power);
+        }
         let Evidence { amplitude, log_bayes_factor, .. } = Evidence::from_score(self.pull, self.power, 1.0);
         (amplitude, log_bayes_factor)
-    }
-
-    /// The latter, of an effect with or without an amplitude.
-    pub fn log_bayes(self, is_switch: bool) -> f64 {
-        if is_switch { self.of_switch().1 } else { self.of_amplitude().1 }
-    }
-
-    /// The same for an effect without an amplitude.
-    pub(crate) fn of_switch(self) -> (f64, f64) {
-        (1.0, self.pull - 0.5 * self.power)
     }
 }
 
@@ -194,9 +175,6 @@ pub(super) fn of_each(machines: &[(Machine, Drives)]) -> Result<Vec<Signatures<'
 }
 
 /// Whitened signatures of some terms about a fit, one a column, per prior standard deviation.
-///
-/// # Errors
-/// [`FitError`].
 pub fn signatures(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<DMatrix<f64>, FitError> {
     let data = fitted.data(data);
     let machines = fitted.machines_on_orbit(data)?;
@@ -230,39 +208,23 @@ pub fn scan(data: &Data, fitted: &Fitted, terms: &[Term]) -> Result<Vec<Candidat
     Ok(terms.chunks(BATCH).flat_map(of_batch).collect())
 }
 
-/// A cause and its rival: norms of what a fit cannot absorb of both, per prior standard deviation.
-#[derive(Debug, Clone, Copy)]
-pub struct Rivals {
-    /// `d P d` of the cause.
-    pub power: f64,
-    /// The same of the rival, 0 of nothing.
-    pub rival: f64,
-    /// `d P d_rival`.
-    pub both: f64,
-    /// Whether each has an amplitude.
-    pub free: [bool; 2],
-}
-
-impl Rivals {
-    /// Expected `ln` Bayes factor of the cause, if it is true and `amplitude` prior standard deviations large (known, as far as the
-    /// prior goes): with the rival's amplitude at its best, `(h - both^2/(1 + h_rival)) a^2/2` or half of `|a d - d_rival|^2` by P, less the difference of
-    /// their corrections for a free amplitude, `ln((1 + h)/(1 + h_rival))/2`.
-    pub fn expected(self, amplitude: f64) -> f64 {
-        let Self { power, rival, both, free: [cause_is_free, rival_is_free] } = self;
-        let left = if rival_is_free {
-            amplitude * amplitude * (power - both * both / (1.0 + rival))
-        } else {
-            amplitude * amplitude * power - 2.0 * amplitude * both + rival
-        };
-        let correction = |is_free: bool, power: f64| if is_free { power.max(0.0).ln_1p() } else { 0.0 };
-        0.5 * (left.max(0.0) - correction(cause_is_free, power) + correction(rival_is_free, rival))
-    }
-}
-
-/// [`Rivals::expected`] of a term of some amplitude (in the unit of its kind) over each of some others, beside a fit.
+/// Expected `ln` Bayes factor of a cause over its rival, if it is true and `amplitude` prior standard deviations large (known, as far as the
+/// prior goes): with the rival's amplitude at its best, `(h - both^2/(1 + h_rival)) a^2/2` or half of `|a d - d_rival|^2` by P, less the difference of
+/// their corrections for a free amplitude, `ln((1 + h)/(1 + h_rival))/2`.
 ///
-/// # Errors
-/// [`FitError`].
+/// `h = d P d` of what a fit cannot absorb of the cause, per prior standard deviation, `both = d P d_rival`, and `h_rival`, 0 of nothing; whether cause and
+/// rival have an amplitude.
+pub fn expected(amplitude: f64, [power, both, rival]: [f64; 3], [cause_is_free, rival_is_free]: [bool; 2]) -> f64 {
+    let left = if rival_is_free {
+        amplitude * amplitude * (power - both * both / (1.0 + rival))
+    } else {
+        amplitude * amplitude * power - 2.0 * amplitude * both + rival
+    };
+    let correction = |is_free: bool, power: f64| if is_free { power.max(0.0).ln_1p() } else { 0.0 };
+    0.5 * (left.max(0.0) - correction(cause_is_free, power) + correction(rival_is_free, rival))
+}
+
+/// [`expected`] of a term of some amplitude (in the unit of its kind) over each of some others, beside a fit.
 pub fn separations(
     data: &Data,
     fitted: &Fitted,
@@ -274,8 +236,7 @@ pub fn separations(
     let amplitude = amplitude / term.kind.prior_scale().unwrap_or(1.0);
     let separation = |(i, other): (usize, &&Term)| {
         let free = [term, other].map(|term| !term.kind.is_switch());
-        let (power, rival, both) = (gram[(0, 0)], gram[(i + 1, i + 1)], gram[(0, i + 1)]);
-        Rivals { power, rival, both, free }.expected(amplitude)
+        expected(amplitude, [gram[(0, 0)], gram[(0, i + 1)], gram[(i + 1, i + 1)]], free)
     };
     Ok(others.iter().enumerate().map(separation).collect())
 }

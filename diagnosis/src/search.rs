@@ -12,7 +12,6 @@
 //! with that in the model (`search/element.rs`).
 
 mod element;
-mod found;
 mod refit;
 mod wandering;
 
@@ -25,17 +24,15 @@ use super::alternatives::{Alternative, Competition, least_weight};
 use super::data::Data;
 use super::discrepancy::{self, Discrepancy};
 use super::element::Element;
-use super::error::FitError;
-use super::fit::Fitted;
-use super::heldout::{lessened, reduced};
+use super::fit::{FitError, Fitted};
+use super::heldout::lessened;
 use super::hypothesis::Hypothesis;
 use super::linearisation::{self, CURVED};
-use super::odds::{ODDS, SORTS, TOO_SMALL, UNMODELLED, UNMODELLED_SEEN, log_prior, odds_beside};
+use super::odds::{ODDS, TOO_SMALL, UNMODELLED, log_prior, log_prior_unmodelled, odds_beside};
 use super::scan::{Candidate, scan};
 use super::term::Term;
 use super::widths;
 use element::weigh_elements;
-pub use found::Found;
 use inference::softplus;
 use refit::{
     BEHIND, BEHIND_SHARE, BETTER, WORTH, first_of, fitted_to, null_beside, refit, relearn, relearnt, settled,
@@ -54,6 +51,33 @@ const PLACES: usize = 3;
 /// Number of candidates that are refitted exactly.
 const LEADERS: usize = 8;
 
+/// The result of the search.
+#[derive(Debug, Clone)]
+pub struct Found {
+    /// The recording, linearised about the machine that was found.
+    pub data: Data,
+    /// The fit without any effect.
+    pub null: Fitted,
+    /// The fit with all effects found.
+    pub best: Fitted,
+    /// The alternatives of each effect of `best`, in its order.
+    pub competitions: Vec<Competition>,
+    /// The alternatives of one more effect.
+    pub next: Competition,
+}
+
+impl Found {
+    /// Probability that the model without effects is complete.
+    pub fn nothing(&self) -> f64 {
+        self.competitions.iter().fold(self.next.nothing, |least, competition| least.min(competition.nothing))
+    }
+
+    /// True if the best fit has anything that the one without effects has not.
+    pub fn has_more(&self) -> bool {
+        !self.competitions.is_empty() || self.best.hypothesis.element.is_some()
+    }
+}
+
 /// The competition of the one effect that was added to those found, if it is not needed, and neither is a further one.
 fn not_needed(found: &Found, further: &Found) -> Option<Competition> {
     let is_new = |(_, term): &(&Competition, &Term)| !found.best.hypothesis.terms.contains(term);
@@ -67,7 +91,7 @@ fn not_needed(found: &Found, further: &Found) -> Option<Competition> {
 
 /// Correction of a first search for an unmodelled discrepancy: the `ln` Bayes factor that gives even odds.
 pub fn correction_of(discrepancy: &Discrepancy) -> f64 {
-    -(UNMODELLED_SEEN * ODDS / (SORTS * discrepancy.sites) as f64).ln()
+    -log_prior_unmodelled(ODDS, discrepancy.sites)
 }
 
 /// The candidates of a recording, with their prior.
@@ -87,9 +111,6 @@ impl Search {
     }
 
     /// Search.
-    ///
-    /// # Errors
-    /// [`FitError`].
     pub fn run(&self, data: Data) -> Result<Found, FitError> {
         let found = self.grown(self.with_noise(self.without_effects(data)?)?)?;
         // where that fails the search stands as it is
@@ -262,7 +283,7 @@ impl Search {
 
     /// The competition of one of the effects of a fit.
     fn without(&self, data: &Data, fitted: &Fitted, term: usize) -> Result<Competition, FitError> {
-        let rest = relearnt(data, reduced(data, fitted, term)?);
+        let rest = relearnt(data, lessened(data, fitted, fitted.hypothesis.without(term))?);
         // the others are fitted to the readings of the rest
         let present = if data.is_about_effects { fitted.clone().keeping(data) } else { fitted.clone() };
         let present = Alternative::exact(data, &rest, present, term);
@@ -314,8 +335,7 @@ impl Search {
         relearn(data, fitted, &mut weights, &outstanding);
         // by its prior each weighs less than its evidence
         for discrepancy in discrepancy::scan(data, fitted, least_weight(&weights))? {
-            let prior = (UNMODELLED_SEEN * odds / (SORTS * discrepancy.sites) as f64).ln();
-            let weight = discrepancy.log_bayes + prior;
+            let weight = discrepancy.log_bayes + log_prior_unmodelled(odds, discrepancy.sites);
             weights.push((Alternative::unmodelled(discrepancy), weight));
         }
         weigh_elements(data, fitted, &mut weights)?;

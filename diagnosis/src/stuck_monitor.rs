@@ -1,50 +1,32 @@
 //! Monitors that repeat one value for a part of the recording. The screening puts these readings aside, and the monitor counts in all other frames; one
 //! that ends so is dead, and counts nowhere.
 
-use core::fmt;
 use core::ops::Range;
 
 use estimator::MonitorState;
 
 use super::data::Data;
 
-/// One of them.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Stuck {
-    /// The recording.
-    pub recording: String,
-    /// The monitor.
-    pub monitor: String,
-    /// The longest part in which it repeats one value.
-    pub frames: Range<usize>,
-}
-
 /// Fewest frames that are said.
 const FEWEST: usize = 8;
 /// Expected number of such parts by chance up to which one is none: readings of a coarse digitiser often repeat.
 const CHANCE: f64 = 1e-3;
 
-impl Stuck {
-    /// Of each recording those that are not dead.
-    pub fn all(data: &Data) -> Vec<Self> {
-        data.campaigns().flat_map(Self::in_campaign).collect()
-    }
-
-    fn in_campaign(own: &Data) -> Vec<Self> {
-        let names = own.ring.monitor_names();
-        // where most monitors repeat their values there was no beam, or no new reading: that is said of the frames
-        let monitors: Vec<usize> = (0..own.monitors()).collect();
-        let repeats = |frame: usize, b: usize| frame > 0 && own.recorded(frame, b) == own.recorded(frame - 1, b);
-        let frames = own.pools.of_frame.len();
-        let by_all = |frame: usize| 2 * monitors.iter().filter(|&&b| repeats(frame, b)).count() > monitors.len();
-        let alike: Vec<bool> = (0..frames).map(by_all).collect();
-        let of_monitor = |&b: &usize| {
-            let repeated: Vec<bool> = (0..frames).map(|frame| repeats(frame, b) && !alike[frame]).collect();
-            let frames = longest(&repeated).filter(|_| own.health()[b].state != MonitorState::Dead)?;
-            Some(Self { recording: own.name.clone(), monitor: names[b].clone(), frames })
-        };
-        monitors.iter().filter_map(of_monitor).collect()
-    }
+/// Names the stuck monitors of a recording that are not dead, each with the longest part in which it repeats one value.
+pub fn stuck_monitors(own: &Data) -> Vec<String> {
+    let names = own.ring.monitor_names();
+    // where most monitors repeat their values there was no beam, or no new reading: that is said of the frames
+    let monitors: Vec<usize> = (0..own.monitors()).collect();
+    let repeats = |frame: usize, b: usize| frame > 0 && own.recorded(frame, b) == own.recorded(frame - 1, b);
+    let frames = own.pools.of_frame.len();
+    let by_all = |frame: usize| 2 * monitors.iter().filter(|&&b| repeats(frame, b)).count() > monitors.len();
+    let alike: Vec<bool> = (0..frames).map(by_all).collect();
+    let of_monitor = |&b: &usize| {
+        let repeated: Vec<bool> = (0..frames).map(|frame| repeats(frame, b) && !alike[frame]).collect();
+        let Range { start, end } = longest(&repeated).filter(|_| own.health()[b].state != MonitorState::Dead)?;
+        Some(format!("monitor {} repeats one value in frames {start} to {}", names[b], end - 1))
+    };
+    monitors.iter().filter_map(of_monitor).collect()
 }
 
 /// The longest part in which every frame repeats the one before, if chance makes none as long, judged by how often frames elsewhere do.
@@ -65,30 +47,21 @@ fn longest(repeated: &[bool]) -> Option<Range<usize>> {
     (best.len() >= FEWEST && by_chance < CHANCE).then_some(best)
 }
 
-impl fmt::Display for Stuck {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { monitor, frames, .. } = self;
-        write!(f, "monitor {monitor} repeats one value in frames {} to {}", frames.start, frames.end - 1)
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-
     use super::*;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     #[test]
     fn a_monitor_that_repeats_a_value_is_told_and_a_lost_beam_is_not_that() {
         let (ring, recording) = template();
-        let data = |recording: &_| Data::from_campaign(&Campaign::of(&ring, recording).unwrap()).unwrap();
-        assert_eq!(Stuck::all(&data(&recording)), []);
+        let data = |recording: &_| whitened(&ring, recording);
+        assert!(stuck_monitors(&data(&recording)).is_empty());
         let mut broken = recording.clone();
         let value = broken.rows[100].reading[7];
         broken.rows[101..215].iter_mut().for_each(|row| row.reading[7] = value);
         broken.rows[300..312].iter_mut().flat_map(|row| &mut row.reading).for_each(|reading| *reading = Some(0.0));
-        let told: Vec<String> = Stuck::all(&data(&broken)).iter().map(ToString::to_string).collect();
+        let told = stuck_monitors(&data(&broken));
         assert_eq!(told, [format!("monitor {} repeats one value in frames 100 to 214", ring.monitor_names()[7])]);
     }
 

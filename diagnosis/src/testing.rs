@@ -2,13 +2,16 @@
 
 use std::path::Path;
 
+use inference::Campaign;
 use inference::recording::Recording;
-use inference::simulate::{Beyond, Hardware, Truth};
+use inference::simulate::{self, Beyond, Hardware, Truth};
 use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
 use twin::{Cycle, Effect, Hold, Optics, Ring};
+
+use crate::data::Data;
 
 /// A campaign of the repository, on the ring as designed.
 pub fn template() -> (Ring, Recording) {
@@ -18,10 +21,21 @@ pub fn template() -> (Ring, Recording) {
     (ring, recording)
 }
 
-/// Hardware without noise, offsets or jumps.
-pub fn ideal(ring: &Ring) -> Hardware {
-    let noise = vec![0.0; ring.read_monitors.len()];
-    Hardware { misalignment: [1.8e-4; 2], offset: 0.0, noise, jumps: Vec::new(), tune_noise: 0.0 }
+/// A recording whitened.
+pub fn whitened(ring: &Ring, recording: &Recording) -> Data {
+    Data::from_campaign(&Campaign::of(ring, recording).unwrap()).unwrap()
+}
+
+/// The template's campaign on a machine with some vars, effects and more, with the hardware of the shipped recordings.
+pub fn simulated(vars: &[f64], effects: &[Effect], beyond: &[&dyn Beyond], seed: u64) -> Recording {
+    let (ring, recording) = template();
+    let truth = Truth { vars, effects, beyond };
+    simulate::campaign(&recording, &ring, &truth, &Hardware::shipped(&ring, &recording), seed).unwrap()
+}
+
+/// A standard normal number.
+pub fn normal(random: &mut StdRng) -> f64 {
+    StandardNormal.sample(random)
 }
 
 /// Neighbours that share a crate.
@@ -52,7 +66,7 @@ pub struct Coloured {
 impl Coloured {
     /// As the header states it, on a machine of random vars.
     pub(crate) fn white(ring: &Ring, recording: &Recording, seed: u64) -> Self {
-        let vars = inference::simulate::vars(ring, true, seed).unwrap();
+        let vars = simulate::vars(ring, true, seed).unwrap();
         let made = recording.powered(ring).with_vars(&vars);
         let optics = Optics::of(&made, Hold::Momentum { delta: 0.0 }).unwrap();
         let dispersion = optics.dispersion_of(&optics.read_monitors());
@@ -82,14 +96,14 @@ impl Coloured {
         }
         let beyond: Vec<&dyn Beyond> = more.iter().copied().chain([self as &dyn Beyond]).collect();
         let truth = Truth { vars: &self.vars, effects, beyond: &beyond };
-        inference::simulate::campaign(recording, ring, &truth, &hardware, self.seed).unwrap()
+        simulate::campaign(recording, ring, &truth, &hardware, self.seed).unwrap()
     }
 }
 
 impl Beyond for Coloured {
     fn alter_readings(&self, _: &[Cycle], readings: &mut DMatrix<f64>) {
         let mut random = StdRng::seed_from_u64(self.seed ^ 0x5eed);
-        let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
+        let mut normal = || normal(&mut random);
         if !self.common.is_empty() {
             *readings += &self.common;
         }

@@ -52,11 +52,6 @@ impl Units {
         self.range.len()
     }
 
-    /// True without any.
-    pub fn is_empty(&self) -> bool {
-        self.range.is_empty()
-    }
-
     /// Params of the first unknowns.
     pub fn params(&self, u: &DVector<f64>) -> Vec<f64> {
         (0..self.len()).map(|i| self.mean[i] + self.sigma[i] * u[i]).collect()

@@ -5,17 +5,26 @@ use twin::{EffectKind, Plane};
 use super::element::Form;
 use super::term::Term;
 
-/// One unknown besides the vars, with its prior standard deviation.
+/// One unknown besides the vars.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Unknown {
+pub struct Unknown {
+    /// What it is.
+    pub quantity: Quantity,
+    /// Its prior standard deviation.
+    pub sigma: f64,
+}
+
+/// What an unknown is, whatever its width.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Quantity {
     /// The amplitude of a term.
-    Amplitude(usize, f64),
+    Amplitude(Term),
     /// The orbit of a recording at an element, in x or y [m].
-    Orbit(usize, usize, Plane, f64),
+    Orbit(usize, usize, Plane),
     /// The strength of a form of an unknown element near a quadrupole.
-    Form(usize, Form, f64),
+    Form(usize, Form),
     /// One ordinary imperfection.
-    Ordinary(Member, f64),
+    Ordinary(Member),
 }
 
 /// Effects that share an amplitude.
@@ -65,23 +74,14 @@ impl Unknown {
     /// True for an ordinary imperfection that does not change the focusing: of others the vars absorb most, and the two cancel only if both are
     /// evaluated for the same machine.
     pub(crate) fn is_of_first_order(&self) -> bool {
-        matches!(self, Self::Ordinary(member, _) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
+        matches!(&self.quantity, Quantity::Ordinary(member) if member.terms.iter().all(|term| !is_absorbed(term.kind)))
     }
 
     /// The least that it is where a fit is linearised about it, in prior standard deviations.
     pub(crate) fn least_start(&self) -> f64 {
-        match self {
-            Self::Ordinary(member, width) if member.is_gain() => LEAST_GAIN / width,
+        match &self.quantity {
+            Quantity::Ordinary(member) if member.is_gain() => LEAST_GAIN / self.sigma,
             _ => f64::NEG_INFINITY,
-        }
-    }
-
-    /// Its prior standard deviation.
-    pub fn sigma(&self) -> f64 {
-        match self {
-            Self::Amplitude(_, sigma) | Self::Orbit(.., sigma) | Self::Form(.., sigma) | Self::Ordinary(_, sigma) => {
-                *sigma
-            }
         }
     }
 }

@@ -8,22 +8,19 @@ use super::alternatives::{Alternative, Cause, Competition};
 use super::chance;
 use super::choice::Choice;
 use super::data::Data;
-use super::error::FitError;
 use super::experiment::Menu;
 use super::family::family_of;
-use super::fit::Fitted;
-use super::heldout::{Block, Score, gain_of_choice, lessened, rival};
+use super::fit::{FitError, Fitted};
+use super::heldout::{Block, Score, gain_of_choice, lessened, without_terms};
 use super::limits::Limits;
 use super::location::Location;
-use super::lost_frames::LostFrames;
-use super::odds::corrections;
-use super::odds::{DECISIVE, SUSPICIOUS};
+use super::lost_frames::lost_frames;
+use super::odds::{DECISIVE, SUSPICIOUS, corrections};
 use super::out_of_range::OutOfRange;
 use super::place_scan::{Interval, PlaceScan};
-use super::readback::Contradiction;
 use super::scan::separations;
 use super::search::Found;
-use super::stuck_monitor::Stuck;
+use super::stuck_monitor::stuck_monitors;
 use super::term::Term;
 use super::tested::Tested;
 use super::transients::Transient;
@@ -294,9 +291,6 @@ impl Finding {
 }
 
 /// Tests of each effect: all effects against all but this one, and the candidates against that.
-///
-/// # Errors
-/// [`FitError`].
 pub fn tests(
     data: &Data,
     found: &Found,
@@ -313,13 +307,17 @@ pub fn tests(
     let test = |i: usize| -> Result<Tested, FitError> {
         // what is ordinary keeps the size that it has beside the effect: without it, it may grow in its place
         let is_all = found.competitions.len() == 1 && found.best.hypothesis.element.is_none();
-        let without = &if is_all { bare.clone() } else { rival(data, &found.best, i)? };
+        let hypothesis = &found.best.hypothesis;
+        let without = &match is_all {
+            true => bare.clone(),
+            false => without_terms(data, &found.best, &hypothesis.terms[i..=i], hypothesis)?,
+        };
         let rival = if is_all { before } else { &Score::from_blocks(data, without, blocks)? };
         let gain = after.gain_over(rival);
         if without.is_poor() {
             return Ok(Tested { gain, of_choice: None, chance: None, is_of_family: false });
         }
-        let kind = found.best.hypothesis.terms[i].kind;
+        let kind = hypothesis.terms[i].kind;
         let is_of_an_instrument = kind.is_of_a_monitor() || kind.is_of_a_corrector();
         let kind_of_family = family_of(kind);
         let is_learnt =
@@ -333,9 +331,6 @@ pub fn tests(
 }
 
 /// Test of the unknown element in the model, all effects against all but this; none where there is no such element.
-///
-/// # Errors
-/// [`FitError`].
 pub fn test_of_element(
     data: &Data,
     found: &Found,
@@ -353,9 +348,6 @@ pub fn test_of_element(
 
 /// One finding for each effect, strongest first, then the most likely cause that is not in the model; `of_means`: the verdict on the means of
 /// settings.
-///
-/// # Errors
-/// [`FitError`].
 pub fn findings(
     data: &Data,
     found: &Found,
@@ -430,7 +422,7 @@ pub fn sentence(
     found: &Found,
     verdict: Verdict,
     findings: &[Finding],
-    contradictions: &[Contradiction],
+    contradictions: Vec<String>,
     beyond: &[OutOfRange],
 ) -> String {
     let phrases =
@@ -448,8 +440,7 @@ pub fn sentence(
         Verdict::Ambiguous => ambiguous(findings),
         Verdict::Unexplained => unexplained(found, findings),
     };
-    let contradicted = contradictions.iter().map(|one| in_recording(data, &one.recording, one.to_string()));
-    let mut said: Vec<String> = contradicted.chain(beyond.iter().map(OutOfRange::to_string)).collect();
+    let mut said: Vec<String> = contradictions.into_iter().chain(beyond.iter().map(OutOfRange::to_string)).collect();
     let rows = widths::rows(data, &found.best).into_iter();
     let (common, scatters): (Vec<Imperfection>, Vec<Imperfection>) = rows.partition(|row| row.measure == Measure::Mean);
     let off = Imperfection::told(&common).map(|told| format!("{THROUGHOUT}: {told}"));
@@ -466,7 +457,7 @@ pub fn sentence(
 }
 
 /// What is said of one of several recordings.
-fn in_recording(data: &Data, recording: &str, said: String) -> String {
+pub(super) fn in_recording(data: &Data, recording: &str, said: String) -> String {
     if data.is_joint() { format!("in {recording} {said}") } else { said }
 }
 
@@ -478,8 +469,10 @@ fn remarks(data: &Data) -> Vec<String> {
         remarks.extend(own.noise.remarks().into_iter().map(|said| in_recording(data, &own.name, said)));
         remarks.extend(wandering(own).into_iter().map(|said| in_recording(data, &own.name, said)));
     }
-    remarks.extend(Stuck::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
-    remarks.extend(LostFrames::all(data).iter().map(|one| in_recording(data, &one.recording, one.to_string())));
+    for own in data.campaigns() {
+        remarks.extend(stuck_monitors(own).into_iter().map(|said| in_recording(data, &own.name, said)));
+    }
+    remarks.extend(data.campaigns().filter_map(|own| Some(in_recording(data, &own.name, lost_frames(own)?))));
     let faulty: Vec<String> = (data.health_in_any().iter().zip(data.ring.monitor_names()))
         .filter(|(health, _)| health.state != estimator::MonitorState::Ok)
         .map(|(_, name)| name)
@@ -603,9 +596,6 @@ pub fn menu(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<(Menu
 }
 
 /// The measurement that would best separate the two most likely causes, for an ambiguous verdict.
-///
-/// # Errors
-/// [`FitError`].
 pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<Option<String>, FitError> {
     let Some((menu, [one, against])) = menu(data, found, verdict)? else { return Ok(None) };
     Ok(menu.proposals.first().map(|best| {
@@ -618,12 +608,11 @@ pub fn next_measurement(data: &Data, found: &Found, verdict: Verdict) -> Result<
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
     use twin::Site;
 
     use super::*;
     use crate::discrepancy::Discrepancy;
-    use crate::testing::template;
+    use crate::testing::{template, whitened};
 
     /// At 1.5 standard errors chance decides, and without a choice that predicts nothing does.
     #[test]
@@ -643,7 +632,7 @@ mod tests {
     #[test]
     fn an_effect_at_an_instrument_that_does_something_unknown_is_a_part_of_that() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let alternative = |cause: Cause, probability: f64| Alternative {
             probability,
             ..Alternative::unfitted(cause, 50.0, (-0.2, 0.01))

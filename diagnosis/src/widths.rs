@@ -27,7 +27,7 @@ use super::fit::Fitted;
 use super::hypothesis::Hypothesis;
 use super::scatter::{self, Scatter};
 use super::term::Term;
-use super::unknown::{Member, Unknown};
+use super::unknown::{Member, Quantity};
 use inference::{Imperfection, Measure};
 
 /// Widths of its family from which on a member stands out: of 48 of a normal distribution the largest is 2.3 on average.
@@ -45,8 +45,8 @@ const SETTLED: f64 = 0.01;
 struct Projected {
     gram: DMatrix<f64>,
     pull: DVector<f64>,
-    /// Whose width each has.
-    of: Vec<Whose>,
+    /// Which of the widths each has: the first that of the vars, then those of the families.
+    of: Vec<usize>,
     /// The vars of focusing quadrupoles, and those of defocusing ones.
     groups: Vec<Vec<usize>>,
 }
@@ -59,48 +59,17 @@ struct Posterior {
     of_means: Vec<f64>,
 }
 
-/// Whose width it is.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Whose {
-    /// That of the vars.
-    Vars,
-    /// That of a family.
-    Family(usize),
-}
-
-/// Widths in units of priors and tolerances.
-#[derive(Debug, Clone)]
-struct Widths {
-    vars: Scatter,
-    families: Vec<f64>,
-}
-
-impl Widths {
-    fn width_of(&self, whose: Whose) -> f64 {
-        match whose {
-            Whose::Vars => self.vars.0,
-            Whose::Family(f) => self.families[f],
-        }
-    }
-
-    /// The furthest that one of them moved.
-    fn moved(&self, other: &Self) -> f64 {
-        let of_families = self.families.iter().zip(&other.families).map(|(one, other)| (one - other).abs());
-        of_families.fold((self.vars.0 - other.vars.0).abs(), f64::max)
-    }
-}
-
 impl Projected {
     /// From the normal matrix of a fit, of which the vars are the first unknowns and the members the last.
     fn from_fit(data: &Data, fitted: &Fitted) -> Option<Self> {
         let Hypothesis { ordinary, scatter, .. } = &fitted.hypothesis;
         let sized = |(f, family): (usize, &Family)| {
             let scale = family.tolerance / family.width;
-            iter::repeat_n((Whose::Family(f), scale), family.members(data).len())
+            iter::repeat_n((f + 1, scale), family.members(data).len())
         };
-        let of_vars = iter::repeat_n((Whose::Vars, scatter.0.recip()), fitted.params.len());
+        let of_vars = iter::repeat_n((0, scatter.0.recip()), fitted.params.len());
         let of_families = ordinary.iter().enumerate().flat_map(sized);
-        let (of, scale): (Vec<Whose>, Vec<f64>) = of_vars.chain(of_families).unzip();
+        let (of, scale): (Vec<usize>, Vec<f64>) = of_vars.chain(of_families).unzip();
         let (all, vars) = (fitted.u.len(), fitted.params.len());
         let others: Vec<usize> = (vars..all + vars - of.len()).collect();
         let own: Vec<usize> = (0..vars).chain(all + vars - of.len()..all).collect();
@@ -125,8 +94,8 @@ impl Projected {
         Some(Self { gram, pull, of, groups })
     }
 
-    fn posterior(&self, widths: &Widths) -> Option<Posterior> {
-        let w = DVector::from_iterator(self.of.len(), self.of.iter().map(|&whose| widths.width_of(whose)));
+    fn posterior(&self, widths: &[f64]) -> Option<Posterior> {
+        let w = DVector::from_iterator(self.of.len(), self.of.iter().map(|&of| widths[of]));
         let mut matrix = self.gram.clone();
         matrix.column_iter_mut().zip(w.iter()).for_each(|(mut column, s)| column.component_mul_assign(&(&w * *s)));
         (0..w.len()).for_each(|i| matrix[(i, i)] += 1.0);
@@ -157,24 +126,22 @@ impl Projected {
         of_each.fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
     }
 
-    /// The most likely widths of the vars and of the families that are learnt, from a start.
-    fn widths(&self, mut widths: Widths, is_learnt: &[bool]) -> Widths {
+    /// The most likely widths of the vars and of the families that are learnt, from a start, in units of priors and tolerances; `is_learnt`: each family.
+    fn widths(&self, mut widths: Vec<f64>, is_learnt: &[bool]) -> Vec<f64> {
         for _ in 0..STEPS {
             let Some(posterior) = self.posterior(&widths) else { break };
             let Posterior { mean, variance, .. } = &posterior;
-            let of_family = |(f, &width): (usize, &f64)| {
-                let members = || (0..mean.len()).filter(|&i| self.of[i] == Whose::Family(f));
+            let of_family = |(f, &is_learnt): (usize, &bool)| {
+                let (width, members) = (widths[f + 1], || (0..mean.len()).filter(|&i| self.of[i] == f + 1));
                 let squares: f64 = members().map(|i| mean[i].powi(2)).sum();
                 let known: f64 = members().map(|i| 1.0 - variance[i]).sum();
                 let next = width * (squares / (known + width.powi(2)).max(f64::MIN_POSITIVE)).sqrt();
-                if is_learnt[f] { next } else { width }
+                if is_learnt { next } else { width }
             };
             let (squares, known) = self.scatter(&posterior);
-            let next = Widths {
-                vars: Scatter::from_squares(squares * widths.vars.0.powi(2), known),
-                families: widths.families.iter().enumerate().map(of_family).collect(),
-            };
-            let moved = next.moved(&widths);
+            let Scatter(of_vars) = Scatter::from_squares(squares * widths[0].powi(2), known);
+            let next: Vec<f64> = iter::once(of_vars).chain(is_learnt.iter().enumerate().map(of_family)).collect();
+            let moved = next.iter().zip(&widths).map(|(one, other)| (one - other).abs()).fold(0.0, f64::max);
             widths = next;
             if moved < SETTLED {
                 break;
@@ -189,12 +156,13 @@ pub fn learnt(data: &Data, fitted: &Fitted) -> Hypothesis {
     let mut hypothesis = fitted.hypothesis.clone();
     let Some(projected) = Projected::from_fit(data, fitted) else { return hypothesis };
     let families = &mut hypothesis.ordinary;
-    let of_families = families.iter().map(|family| family.width / family.tolerance).collect();
+    let of_families = families.iter().map(|family| family.width / family.tolerance);
+    let start = iter::once(hypothesis.scatter.0).chain(of_families).collect();
     let is_learnt: Vec<bool> = families.iter().map(Family::is_learnt).collect();
-    let widths = projected.widths(Widths { vars: hypothesis.scatter, families: of_families }, &is_learnt);
-    families.iter_mut().zip(&widths.families).for_each(|(family, width)| family.width = family.tolerance * width);
+    let widths = projected.widths(start, &is_learnt);
+    families.iter_mut().zip(&widths[1..]).for_each(|(family, width)| family.width = family.tolerance * width);
     families.retain(|family| !family.is_learnt() || family.width > NONE * family.tolerance);
-    hypothesis.scatter = widths.vars;
+    hypothesis.scatter = Scatter(widths[0]);
     hypothesis
 }
 
@@ -205,8 +173,8 @@ pub fn outstanding(data: &Data, fitted: &Fitted) -> Vec<Term> {
     // the amplitude of each member in widths of its family, and in its unit
     let members: Vec<(&Member, f64, f64)> = (unknowns.iter())
         .zip(fitted.u.iter().skip(fitted.params.len()))
-        .filter_map(|(unknown, u)| match unknown {
-            Unknown::Ordinary(member, width) => Some((member, u.abs(), u * width)),
+        .filter_map(|(unknown, u)| match &unknown.quantity {
+            Quantity::Ordinary(member) => Some((member, u.abs(), u * unknown.sigma)),
             _ => None,
         })
         .collect();
@@ -281,21 +249,19 @@ fn information(covariance: &DMatrix<f64>, of: Range<usize>) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Coloured, template};
-    use inference::Campaign;
+    use crate::testing::{Coloured, template, whitened};
 
     /// Members that the recording shows in full are as wide as their rms; those that it does not show at all get no width.
     #[test]
     fn a_width_is_the_rms_of_well_known_members_and_none_without_any() {
-        let of = [Whose::Family(0); 20].into_iter().chain([Whose::Family(1); 20]).collect();
+        let of = [1; 20].into_iter().chain([2; 20]).collect();
         let amplitudes = DVector::from_fn(40, |i, _| if i < 20 { f64::sin(2.4 * i as f64) } else { 0.0 });
         let gram = DMatrix::from_diagonal_element(40, 40, 1e6);
         let projected = Projected { pull: &gram * amplitudes, gram, of, groups: Vec::new() };
-        let start = Widths { vars: Scatter::default(), families: vec![1.0, 1.0] };
-        let Widths { vars, families: width } = projected.widths(start, &[true, true]);
-        assert_eq!(vars, Scatter::default(), "there are none");
+        let width = projected.widths(vec![1.0; 3], &[true, true]);
+        assert_eq!(width[0], 1.0, "there are no vars");
         // rms 0.71 of 20, and the prior of width 1 takes the square root of 1 - 0.5/20
-        assert!((width[0] - 0.70).abs() < 0.02 && width[1] < NONE, "{width:?}");
+        assert!((width[1] - 0.70).abs() < 0.02 && width[2] < NONE, "{width:?}");
     }
 
     /// Two groups of 20 whose means are 3 and -2 prior widths.
@@ -305,10 +271,10 @@ mod tests {
         let own = |i: usize| f64::sin(2.4 * i as f64);
         let amplitudes = DVector::from_fn(40, |i, _| own(i) + if i < 20 { 3.0 } else { -2.0 });
         let gram = DMatrix::from_diagonal_element(40, 40, 1e6);
-        let projected = Projected { pull: &gram * amplitudes, gram, of: vec![Whose::Vars; 40], groups };
-        let Widths { vars, .. } = projected.widths(Widths { vars: Scatter::default(), families: vec![] }, &[]);
+        let projected = Projected { pull: &gram * amplitudes, gram, of: vec![0; 40], groups };
+        let width = projected.widths(vec![1.0], &[])[0];
         // mean square 0.5 of 38, and that of the prior, 1, of two more
-        assert!((vars.0 - (21.0_f64 / 40.0).sqrt()).abs() < 0.02, "{vars:?}");
+        assert!((width - (21.0_f64 / 40.0).sqrt()).abs() < 0.02, "{width}");
     }
 
     /// Vars of half and of the whole width of their prior, in four campaigns each: the scatter is known to a tenth or so.
@@ -322,8 +288,7 @@ mod tests {
             let power = if seed % 2 == 0 { 0.5 } else { 1.0 };
             made.vars.iter_mut().for_each(|var| *var = var.powf(power));
             let rms = (made.vars.iter().map(|var| var.ln().powi(2)).sum::<f64>() / made.vars.len() as f64).sqrt();
-            let data =
-                Data::from_campaign(&Campaign::of(&ring, &made.campaign(&ring, &recording, &[])).unwrap()).unwrap();
+            let data = whitened(&ring, &made.campaign(&ring, &recording, &[]));
             let first = Fitted::from_guess(&data, &Hypothesis::plain(), &DVector::zeros(data.units.len())).unwrap();
             let hypothesis = learnt(&data, &first);
             let fitted = Fitted::from_guess(&data, &hypothesis, &first.guess(&data, &hypothesis)).unwrap();
@@ -340,7 +305,7 @@ mod tests {
     #[test]
     fn families_hold_every_instrument_once() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let of = |name: &str| Family::all().into_iter().find(|family| family.name == name).unwrap().members(&data);
         assert_eq!(of("gains of monitors").len(), 33);
         let together = [of("gain of all horizontal monitors"), of("gain of all vertical monitors")];
@@ -357,7 +322,7 @@ mod tests {
     #[test]
     fn ordinary_imperfections_are_of_first_order() {
         let (ring, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let plain = Hypothesis::plain();
         let first = Fitted::from_guess(&data, &plain, &DVector::zeros(data.units.len())).unwrap();
         let second = Fitted::from_guess(&data, &plain, &first.u).unwrap();

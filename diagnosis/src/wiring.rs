@@ -20,6 +20,7 @@ use evidence::{Factor, gram};
 use nalgebra::{DMatrix, DMatrixView, DVector, Matrix2, Vector2};
 use twin::{EffectError, Hold, Machine, Optics, OrbitError, Plane, Rf, Ring};
 
+use super::columns::beside;
 use inference::recording::Recording;
 use inference::{Drive, Prior};
 
@@ -101,12 +102,6 @@ struct Designs<'m> {
     off: Vec<f64>,
 }
 
-/// `ln` likelihood of a wiring, and the designs that suit it best in x and y.
-struct Best {
-    log_likelihood: f64,
-    at: [usize; 2],
-}
-
 /// The measured response and the scale of the design's.
 struct Measured<'r> {
     ring: &'r Ring,
@@ -173,7 +168,7 @@ impl<'m> Designs<'m> {
             self.add(STEP * f64::from(step));
         }
         for round in 1..=ROUNDS {
-            let best = measured.best(self, None).at.map(|i| self.off[i]);
+            let best = measured.best(self, None).1.map(|i| self.off[i]);
             for off in best {
                 [-1.0, 1.0].into_iter().for_each(|side| self.add(off + side * STEP * 0.5_f64.powi(round)));
             }
@@ -243,13 +238,7 @@ fn responses(machine: &Machine, ring: &Ring) -> Result<[[DMatrix<f64>; 2]; 2], O
     Ok(observers.each_ref().map(|observers| {
         // as if a loop were open for the steps
         let rf = optics.dispersion_of(observers) / -optics.slip_factor();
-        sources.each_ref().map(|sources| {
-            let response = held.response(&optics, observers, sources);
-            let at = response.ncols();
-            let mut response = response.insert_column(at, 0.0);
-            response.set_column(at, &rf);
-            response
-        })
+        sources.each_ref().map(|sources| beside(held.response(&optics, observers, sources), &rf))
     }))
 }
 
@@ -309,8 +298,6 @@ impl<'r> Measured<'r> {
     /// The measured response with the columns put right, and `ln` of the change of its unit.
     fn put_right(&self, wiring: Option<(Columns, Fault)>) -> (DMatrix<f64>, f64) {
         let Some((columns, fault)) = wiring else { return (self.response.clone(), 0.0) };
-        let stated = self.late(fault).map_or(&self.response, |(late, _)| late);
-        let mut response = stated.clone();
         let range = self.range(columns);
         let of_readings = matches!(columns, Columns::Readings(_));
         let factor = match (fault, of_readings) {
@@ -321,20 +308,18 @@ impl<'r> Measured<'r> {
             _ => 1.0,
         };
         let from = |i: usize| match fault {
-            Fault::Shifted(by) if range.contains(&i) => {
+            Fault::Shifted(by) => {
                 range.start + ((i - range.start) as isize + by).rem_euclid(range.len() as isize) as usize
             }
             _ => i,
         };
-        for b in 0..response.nrows() {
-            for c in 0..response.ncols() {
-                let (row, column) = if of_readings { (from(b), c) } else { (b, from(c)) };
-                let concerned = range.contains(if of_readings { &b } else { &c });
-                response[(b, c)] = stated[(row, column)] * if concerned { factor } else { 1.0 };
-            }
-        }
-        let share = range.len() as f64 / if of_readings { response.nrows() } else { response.ncols() } as f64;
-        (response, factor.abs().ln() * share)
+        // rows those of the columns, monitors or correctors
+        let turned = |response: &DMatrix<f64>| if of_readings { response.clone() } else { response.transpose() };
+        let stated = turned(self.late(fault).map_or(&self.response, |(late, _)| late));
+        let mut right = stated.clone();
+        range.clone().for_each(|i| right.set_row(i, &(stated.row(from(i)) * factor)));
+        let share = range.len() as f64 / stated.nrows() as f64;
+        (turned(&right), factor.abs().ln() * share)
     }
 
     /// The design that a wiring is compared with.
@@ -349,9 +334,9 @@ impl<'r> Measured<'r> {
     /// The wirings that are more likely than that of the header, if any.
     fn judged(&self, designs: &Designs) -> Option<Miswired> {
         let wrong = wirings();
-        let stated = self.best(designs, None).log_likelihood + AS_STATED.ln();
+        let stated = self.best(designs, None).0 + AS_STATED.ln();
         let prior = ((1.0 - AS_STATED) / wrong.len() as f64).ln();
-        let weights: Vec<f64> = wrong.iter().map(|one| self.best(designs, Some(*one)).log_likelihood + prior).collect();
+        let weights: Vec<f64> = wrong.iter().map(|one| self.best(designs, Some(*one)).0 + prior).collect();
         let largest = weights.iter().copied().fold(stated, f64::max);
         let sum = weights.iter().map(|weight| (weight - largest).exp()).sum::<f64>() + (stated - largest).exp();
         let wiring = |(&(columns, fault), weight): (&(Columns, Fault), &f64)| Wiring {
@@ -367,8 +352,8 @@ impl<'r> Measured<'r> {
         (refused && !likely.is_empty()).then_some(Miswired(likely))
     }
 
-    /// `ln` likelihood of a wiring, that of the header if none, at the tunes that suit it best.
-    fn best(&self, designs: &Designs, wiring: Option<(Columns, Fault)>) -> Best {
+    /// `ln` likelihood of a wiring, that of the header if none, at the tunes that suit it best, and the designs of these in x and y.
+    fn best(&self, designs: &Designs, wiring: Option<(Columns, Fault)>) -> (f64, [usize; 2]) {
         let (response, log_scale) = self.put_right(wiring);
         let n = 2.0 * (response.nrows() + response.ncols()) as f64;
         let of_readings = wiring.and_then(|(_, fault)| self.late(fault)).map_or(0.0, |(_, of_readings)| *of_readings);
@@ -378,10 +363,9 @@ impl<'r> Measured<'r> {
         let judged = |at: [usize; 2]| {
             let spread = n * (off[at[0]][0] + off[at[1]][1]) / (FREEDOM * self.scatter);
             let prior: f64 = at.iter().map(|&i| designs.log_prior(i)).sum();
-            Best { log_likelihood: prior - 0.5 * (FREEDOM + n) * spread.ln_1p() + n * log_scale + of_readings, at }
+            (prior - 0.5 * (FREEDOM + n) * spread.ln_1p() + n * log_scale + of_readings, at)
         };
-        let best = pairs.map(judged).max_by(|one, other| one.log_likelihood.total_cmp(&other.log_likelihood));
-        best.expect("at least the design")
+        pairs.map(judged).max_by(|(one, _), (other, _)| one.total_cmp(other)).expect("at least the design")
     }
 
     /// Square of the difference in units of the design's rms, of the monitors in x and of those in y, over the weight of all: each number

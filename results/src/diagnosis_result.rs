@@ -314,7 +314,7 @@ impl FindingResult {
 /// Tunes of the machine that was found, what is ordinary included, at the recording's mean supply currents; none if it is unstable.
 fn tunes_of(diagnosis: &Diagnosis) -> Option<Tunes> {
     let (best, data) = (&diagnosis.found.best, &diagnosis.found.data);
-    let (machine, drives) = best.machine(data).ok()?;
+    let (machine, drives) = best.machine(data, 0).ok()?;
     // on its orbit, where sextupoles focus
     let tunes = machine.on_orbit(&drives.orbit).optics().and_then(|optics| optics.tunes()).ok()?;
     let [x, y] = best.tunes_of_element(data).ok()?;

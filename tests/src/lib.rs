@@ -7,6 +7,7 @@ pub mod endurance;
 pub mod faults;
 pub mod feedback;
 pub mod machine;
+pub mod posterior;
 pub mod qemu;
 pub mod sil;
 pub mod soak;

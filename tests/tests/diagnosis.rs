@@ -3,11 +3,12 @@
 
 use std::collections::BTreeSet;
 
-use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Term, Verdict, candidates, sample, scan};
+use diagnosis::{Data, Diagnosis, Fitted, Hypothesis, Term, Verdict, candidates, scan};
 use inference::nuts::NutsSettings;
 use inference::simulate::{self, Hardware};
 use inference::{Campaign, Imperfection, Measure, Recording};
 use nalgebra::DVector;
+use system_tests::posterior::sample;
 use system_tests::{recording, repository};
 use twin::{Effect, EffectKind, Machine, Measured, Rf, Ring};
 use validation::{Cases, Class, Grade, Truth, Unmodelled, UnmodelledKind};
@@ -343,7 +344,7 @@ fn the_extended_machine_is_that_of_the_findings() {
     let of_ring = recording("concealed/open-02");
     let (ring, data) = (&of_ring.0, whitened(&of_ring));
     let hypothesis = Hypothesis::default().with(Term::at(EffectKind::BpmGain, "x_E6", ring).unwrap());
-    let (machine, _) = hypothesis.machine(&data, &[0.0; 48], &[-1.0]).unwrap();
+    let (machine, _) = hypothesis.machine(&data, 0, &[0.0; 48], &[-1.0]).unwrap();
     let strength = ring.strengths(&[0.0; 48], &data.supplies);
     let gain = Effect::parse("bpm_gain@x_E6=-0.08", ring).unwrap();
     let direct = Machine::new(ring.with_strengths(&strength), Rf::FixedMomentum, &[gain]).unwrap();

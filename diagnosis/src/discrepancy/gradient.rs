@@ -198,13 +198,12 @@ impl Linearised<'_> {
 
 #[cfg(test)]
 mod tests {
-    use inference::Campaign;
-    use inference::simulate::{self, Beyond, Hardware, Truth};
+    use inference::simulate;
     use twin::Machine;
     use validation::{Unmodelled, UnmodelledKind};
 
     use super::*;
-    use crate::testing::template;
+    use crate::testing::{simulated, template, whitened};
     use crate::{Diagnosis, Verdict};
 
     /// A gradient moves the orbit of misaligned quadrupoles by what it kicks where that passes its own axis.
@@ -229,7 +228,7 @@ mod tests {
         };
         let exact = (with(1e-4) - with(-1e-4)) / 2e-4;
         let (_, recording) = template();
-        let data = Data::from_campaign(&Campaign::of(&ring, &recording).unwrap()).unwrap();
+        let data = whitened(&ring, &recording);
         let design = machine(&vec![1.0; ring.parameters.len()]);
         let signatures = Signatures::of(&design, &data.drives).unwrap();
         let orbit = design.orbit().unwrap();
@@ -246,15 +245,12 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn a_gradient_that_follows_the_kicks_is_found_at_its_quadrupole() {
-        let (ring, template) = template();
-        let hardware = Hardware::shipped(&ring, &template);
+        let ring = template().0;
         for seed in [3, 4, 5] {
             let vars = simulate::vars(&ring, true, seed).unwrap();
             let mut one = Unmodelled::of(UnmodelledKind::LoopGradient, &ring, seed);
             one.size = 8e-3;
-            let beyond: &[&dyn Beyond] = &[&one];
-            let truth = Truth { vars: &vars, effects: &[], beyond };
-            let recording = simulate::campaign(&template, &ring, &truth, &hardware, seed).unwrap();
+            let recording = simulated(&vars, &[], &[&one], seed);
             let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
             let last = found.findings.last().unwrap();
@@ -267,14 +263,11 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn the_factor_of_a_quadrupole_that_changes_is_as_uncertain_as_it_changes() {
-        let (ring, template) = template();
-        let hardware = Hardware::shipped(&ring, &template);
+        let ring = template().0;
         let mut vars = simulate::vars(&ring, true, 8).unwrap();
         let mut one = Unmodelled::of(UnmodelledKind::QuadJump, &ring, 8);
         one.size = 0.012;
-        let beyond: &[&dyn Beyond] = &[&one];
-        let truth = Truth { vars: &vars, effects: &[], beyond };
-        let recording = simulate::campaign(&template, &ring, &truth, &hardware, 8).unwrap();
+        let recording = simulated(&vars, &[], &[&one], 8);
         let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
         let names = ring.var_names();
         let at = names.iter().position(|name| *name == one.site.name(&ring)).unwrap();

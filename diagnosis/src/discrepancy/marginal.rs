@@ -4,6 +4,7 @@ use evidence::{Evidence, Factor, gram, log_bayes_factor};
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 use super::sums::{Apart, Sums};
+use crate::columns::beside;
 use crate::fit::Fitted;
 use crate::location::Location;
 
@@ -54,14 +55,8 @@ impl<'f> Linearised<'f> {
         Self { fitted, slope: fitted.free.whiten(&fitted.slope), asked: least.max(ASKED) }
     }
 
-    /// Projected pull and Gram matrix of some amplitudes.
-    fn project(&self, sums: &Sums) -> (DVector<f64>, DMatrix<f64>) {
-        let pull = &sums.pull - &sums.cross * &self.slope;
-        (pull, &sums.gram - gram(&sums.cross.transpose()))
-    }
-
     pub fn judge(&self, at: Location, sums: &Sums, sites: usize) -> Discrepancy {
-        let (pull, gram) = self.project(sums);
+        let (pull, gram) = (&sums.pull - &sums.cross * &self.slope, &sums.gram - gram(&sums.cross.transpose()));
         self.conclude(at, marginals(&pull, &gram), sites, &[sums])
     }
 
@@ -82,7 +77,7 @@ impl<'f> Linearised<'f> {
 
     pub fn taken_apart(&self, at: Location, each: &[Sums], apart: &[Apart], sites: usize) -> Discrepancy {
         let sides: Vec<DMatrix<f64>> =
-            each.iter().map(|sums| sums.with_column(&(&sums.pull - &sums.cross * &self.slope))).collect();
+            each.iter().map(|sums| beside(sums.cross.clone(), &(&sums.pull - &sums.cross * &self.slope))).collect();
         let logs = SIZES.map(|size| self.marginal_apart(&sides, apart, size).unwrap_or(f64::NEG_INFINITY));
         self.conclude(at, logs, sites, &each.iter().collect::<Vec<_>>())
     }

@@ -62,7 +62,7 @@ impl Data {
     /// tune meter has too few readings.
     pub fn tune_sums(&self, plane: usize, seen: &Seen, indicator: &DMatrix<f64>) -> Option<Sums> {
         let noise = self.tune_noise(plane)?;
-        Some(self.sums(self.monitors() + plane, seen, &(indicator * (noise / self.mean_noise()))))
+        Some(self.sums(self.monitors() + plane, seen, &(indicator * (noise / self.mean_noise))))
     }
 }
 
@@ -144,14 +144,6 @@ impl Sums {
             all.cross.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.cross.rows(i * from, from)));
             all.pull.rows_mut(i * to, to).copy_from(&steps.tr_mul(&self.pull.rows(i * from, from)));
         }
-        all
-    }
-
-    /// The cross sums, and one more column.
-    pub fn with_column(&self, column: &DVector<f64>) -> DMatrix<f64> {
-        let at = self.cross.ncols();
-        let mut all = self.cross.clone().insert_column(at, 0.0);
-        all.set_column(at, column);
         all
     }
 }

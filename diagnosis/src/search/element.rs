@@ -6,14 +6,13 @@
 
 use twin::Signatures;
 
-use super::found::Found;
+use super::Found;
 use super::refit::{BEHIND, BEHIND_SHARE, WORTH, relearnt};
 use crate::alternatives::{Alternative, Cause};
 use crate::data::Data;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::element::Element;
-use crate::error::FitError;
-use crate::fit::Fitted;
+use crate::fit::{FitError, Fitted};
 use crate::hypothesis::Hypothesis;
 use crate::location::Location;
 use crate::odds::SUSPICIOUS;
@@ -85,9 +84,10 @@ mod tests {
 
     use super::*;
     use crate::term::Term;
+    use crate::testing::{simulated, template};
     use crate::{Diagnosis, Verdict};
     use inference::Recording;
-    use inference::simulate::{self, Beyond, Hardware};
+    use inference::simulate::{self, Beyond};
 
     /// A solenoid in a drift, and by how much it turns the beam.
     struct Solenoid {
@@ -103,11 +103,8 @@ mod tests {
             Self { drift: drifts[one], angle }
         }
 
-        fn campaign(&self, ring: &Ring, template: &Recording, effects: &[Effect], seed: u64) -> Recording {
-            let vars = simulate::vars(ring, true, seed).unwrap();
-            let beyond: &[&dyn Beyond] = &[self];
-            let truth = simulate::Truth { vars: &vars, effects, beyond };
-            simulate::campaign(template, ring, &truth, &Hardware::shipped(ring, template), seed).unwrap()
+        fn campaign(&self, ring: &Ring, effects: &[Effect], seed: u64) -> Recording {
+            simulated(&simulate::vars(ring, true, seed).unwrap(), effects, &[self], seed)
         }
 
         /// True for a place that is no further from it than twice the mean distance of two quadrupoles.
@@ -127,11 +124,11 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn an_element_that_the_library_lacks_is_one_unknown_thing() {
-        let (ring, template) = crate::testing::template();
+        let ring = template().0;
         let solenoid = Solenoid::of(&ring, 20, 0.04);
         let gain = Effect::parse("bpm_gain@x_E6=0.2", &ring).unwrap();
         for effects in [vec![], vec![gain]] {
-            let recording = solenoid.campaign(&ring, &template, &effects, 21);
+            let recording = solenoid.campaign(&ring, &effects, 21);
             let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
             assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.sentence);
             let named: Vec<EffectKind> = found.findings.iter().filter_map(|one| Some(one.term()?.kind)).collect();
@@ -154,14 +151,11 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn two_fields_of_the_library_beside_each_other_are_no_unknown_element() {
-        let (ring, template) = crate::testing::template();
+        let ring = template().0;
         let effects = ["stray_skew_gradient@SLOT_E3=0.012", "quad_roll@E4=-0.02"];
         let effects = effects.map(|text| Effect::parse(text, &ring).unwrap());
         let vars = simulate::vars(&ring, true, 31).unwrap();
-        let truth = simulate::Truth { vars: &vars, effects: &effects, beyond: &[] };
-        let hardware = Hardware::shipped(&ring, &template);
-        let recording = simulate::campaign(&template, &ring, &truth, &hardware, 31).unwrap();
-        let found = Diagnosis::from_recording(&ring, &recording, |_| ()).unwrap();
+        let found = Diagnosis::from_recording(&ring, &simulated(&vars, &effects, &[], 31), |_| ()).unwrap();
         assert!(found.findings.iter().all(|one| one.term().is_some()), "{}", found.sentence);
         let named = |effect: &Effect| found.findings.iter().any(|one| one.term() == Some(&Term::from(*effect)));
         assert!(effects.iter().all(named), "{}", found.sentence);
@@ -171,11 +165,10 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn a_weak_solenoid_is_no_skew_gradient() {
-        let (ring, template) = crate::testing::template();
+        let ring = template().0;
         for (seed, drift) in [(11, 14), (12, 0), (13, 7)] {
             let solenoid = Solenoid::of(&ring, drift, 0.01);
-            let found =
-                Diagnosis::from_recording(&ring, &solenoid.campaign(&ring, &template, &[], seed), |_| ()).unwrap();
+            let found = Diagnosis::from_recording(&ring, &solenoid.campaign(&ring, &[], seed), |_| ()).unwrap();
             let [only] = found.findings.as_slice() else { panic!("{}", found.sentence) };
             assert!(only.term().is_none() && only.phrase.contains("turning them"), "{}", found.sentence);
             assert!(solenoid.is_near(&ring, only.s.unwrap()), "{}", found.sentence);

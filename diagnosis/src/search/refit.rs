@@ -4,14 +4,13 @@ use nalgebra::DVector;
 
 use crate::alternatives::Alternative;
 use crate::data::Data;
-use crate::error::FitError;
 use crate::family::Family;
-use crate::fit::Fitted;
+use crate::fit::{FitError, Fitted};
 use crate::hypothesis::Hypothesis;
 use crate::linearisation::{self, about_itself};
 use crate::scan::Candidate;
 use crate::term::Term;
-use crate::unknown::Unknown;
+use crate::unknown::Quantity;
 use crate::widths;
 
 /// Gain of `ln` posterior that calls for another round of competitions, or of widths.
@@ -100,7 +99,8 @@ pub fn refit(data: &Data, fitted: &Fitted, candidate: &Candidate, least: f64) ->
     let mut guess = fitted.guess(data, &hypothesis);
     let unknowns = hypothesis.unknowns(data);
     let last = hypothesis.terms.len() - 1;
-    if let Some(at) = unknowns.iter().position(|unknown| matches!(unknown, Unknown::Amplitude(i, _) if *i == last)) {
+    let amplitude = Quantity::Amplitude(candidate.term);
+    if let Some(at) = unknowns.iter().position(|unknown| unknown.quantity == amplitude) {
         guess[fitted.params.len() + at] = candidate.amplitude;
     }
     let mut guesses = vec![guess];
@@ -177,7 +177,7 @@ pub fn relearnt(data: &Data, fitted: Fitted) -> Fitted {
     if fitted.is_poor() && !lacks_all {
         return fitted;
     }
-    let kept = fitted.has_own().then(|| fitted.data(data).clone());
+    let kept = fitted.own.as_deref().cloned();
     let data = kept.as_ref().unwrap_or(data);
     let again =
         |hypothesis: Hypothesis, from: &Fitted| Fitted::from_guess(data, &hypothesis, &from.guess(data, &hypothesis));

@@ -149,7 +149,7 @@ impl Differences {
 }
 
 /// Runs of consecutive frames of one setting; a frame of none is a run by itself.
-fn runs(settings: &[Option<usize>]) -> Vec<Range<usize>> {
+pub fn runs(settings: &[Option<usize>]) -> Vec<Range<usize>> {
     let mut runs: Vec<Range<usize>> = Vec::new();
     for (frame, setting) in settings.iter().enumerate() {
         match runs.last_mut() {

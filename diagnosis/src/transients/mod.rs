@@ -14,7 +14,6 @@
 //! predicted by the others.
 
 mod differences;
-mod shown;
 mod signals;
 mod unsteady;
 
@@ -32,15 +31,13 @@ use super::data::{drives_of, rippled};
 use super::discrepancy::Discrepancy;
 use super::heldout::VALIDATED;
 use super::location::Location;
-use super::odds::SORTS;
-use super::odds::SUSPICIOUS;
-use super::odds::{ODDS, UNMODELLED, UNMODELLED_SEEN};
+use super::odds::{ODDS, SUSPICIOUS, UNMODELLED, log_prior_unmodelled};
 use super::term::Term;
 use super::tested::Tested;
-use differences::{Differences, median, run_means};
+use differences::{Differences, median};
+pub(super) use differences::{run_means, runs};
 use inference::Campaign;
 use inference::recording::Recording;
-pub use shown::Shown;
 use signals::Signals;
 use unsteady::Unsteady;
 
@@ -63,6 +60,17 @@ pub struct Transient {
     /// Readings of the frames after a change less the later ones of their run, against what the leading cause should make of them, per unit of its
     /// amplitude [m]; of an unsteady corrector those of every frame less the mean of their run.
     pub shown: Vec<Shown>,
+}
+
+/// A reading of a frame after a change, or of one with a corrector that is unsteady.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Shown {
+    /// Predicted difference [m], per unit of the amplitude of a cause that has one.
+    pub predicted: f64,
+    /// The difference [m].
+    pub measured: f64,
+    /// Its noise [m].
+    pub sigma: f64,
 }
 
 /// Most causes.
@@ -94,9 +102,6 @@ impl Transient {
 
 impl Transients {
     /// Find them, one after the other.
-    ///
-    /// # Errors
-    /// [`OrbitError`].
     pub fn find(ring: &Ring, recording: &Recording) -> Result<Self, OrbitError> {
         let mut campaign = Campaign::of(ring, recording)?;
         let optics = Optics::of(campaign.held.ring(), Hold::Momentum { delta: 0.0 })?;
@@ -144,7 +149,9 @@ struct SettingDifferences<'c> {
     differences: Differences,
     /// Readings at the mean supply currents and kicks [m].
     readings: DMatrix<f64>,
-    /// The same whitened.
+    /// The signals by these.
+    signals: Signals<'c>,
+    /// The readings whitened.
     white: DMatrix<f64>,
     /// The whole former orbit in first frames, whitened.
     former: DMatrix<f64>,
@@ -153,22 +160,11 @@ struct SettingDifferences<'c> {
     terms: Vec<Term>,
 }
 
-/// A stretch of the campaign in which the machine keeps a share of its former orbit.
-struct Stretch {
-    log_bayes: f64,
-    /// Its first and last frame.
-    frames: (usize, usize),
-    share: f64,
-}
-
 /// An effect with its exact signal at its best amplitude.
 struct Fit {
-    /// Its index, and the effect.
+    /// Its index among the terms.
     at: usize,
-    term: Term,
-    amplitude: f64,
-    sigma: f64,
-    log_bayes: f64,
+    alternative: Alternative,
     /// Held-out gain, and its standard error.
     gain: (f64, f64),
     /// The signal [m].
@@ -189,9 +185,10 @@ impl<'c> SettingDifferences<'c> {
             .into_iter()
             .map(|c| Term { kind: EffectKind::CorrectorSettling, site: Site::Corrector(c) });
         let terms = late.chain(settling).collect();
-        let former = differences.whiten(&Signals::from_readings(campaign, &readings).of_former_orbit());
+        let signals = Signals::from_readings(campaign, &readings);
+        let former = differences.whiten(&signals.of_former_orbit());
         let spread = spread(&differences, &former, &white);
-        Self { campaign, differences, readings, white, former, spread, terms }
+        Self { campaign, differences, readings, signals, white, former, spread, terms }
     }
 
     /// The most likely cause, if there is one, and the recording without it.
@@ -199,11 +196,10 @@ impl<'c> SettingDifferences<'c> {
         if self.differences.runs.is_empty() {
             return None;
         }
-        let signals = Signals::from_readings(self.campaign, &self.readings);
-        let slopes: Vec<DMatrix<f64>> = self.terms.iter().map(|&term| self.slope(&signals, term, 0.0)).collect();
+        let slopes: Vec<DMatrix<f64>> = self.terms.iter().map(|&term| self.slope(&self.signals, term, 0.0)).collect();
         let first_order = self.weights(&slopes, &self.white);
         let (of_former, of_terms) = first_order.split_last()?;
-        let (mut fits, mut former) = (self.leaders(of_terms), self.former_orbit(&signals));
+        let (mut fits, mut former) = (self.leaders(of_terms), self.former_orbit());
         let of_former = former.as_ref().map_or(f64::NEG_INFINITY, |_| *of_former);
         let best = fits.iter().map(|fit| of_terms[fit.at]).fold(of_former, f64::max);
         let chance = if best > 0.0 { self.by_chance(&slopes, best) } else { 1.0 };
@@ -211,20 +207,21 @@ impl<'c> SettingDifferences<'c> {
             fits.clear();
             former = None;
         }
-        let mut weights: Vec<(Alternative, f64)> =
-            fits.iter().map(|fit| (fit.alternative(), fit.log_bayes + self.log_prior(fit.term))).collect();
+        let weighed =
+            |fit: &Fit| (fit.alternative.clone(), fit.alternative.log_gain + self.log_prior(self.terms[fit.at]));
+        let mut weights: Vec<(Alternative, f64)> = fits.iter().map(weighed).collect();
         // of a corrector that is unsteady no frame is the first
-        let mut unsteady = self.unsteady(&signals, &self.white);
+        let mut unsteady = self.unsteady(&self.white);
         // and what settles is not unsteady
         if let Some((best, _)) =
             weights.iter().enumerate().max_by(|(_, (_, one)), (_, (_, other))| one.total_cmp(other))
         {
             let left = &self.white - self.differences.whiten(&fits[best].signal);
-            let still = self.unsteady(&signals, &left);
+            let still = self.unsteady(&left);
             unsteady.retain(|one| still.iter().any(|other| other.at == one.at));
         }
         weights.extend(former.into_iter().chain(unsteady).map(|one| {
-            let weight = one.log_bayes + log_prior_unmodelled() - (one.sites as f64).ln();
+            let weight = one.log_bayes + log_prior_unmodelled(ODDS, 1) - (one.sites as f64).ln();
             (Alternative::unmodelled(one), weight)
         }));
         // what is too small to be seen is weighed with the search
@@ -233,16 +230,16 @@ impl<'c> SettingDifferences<'c> {
             return None;
         }
         let leading = &alternatives.first()?.cause;
-        let fit = fits.iter().find(|fit| leading.is(&Cause::Effect(fit.term)));
+        let fit = fits.iter().find(|fit| leading.is(&fit.alternative.cause));
         let tested =
             fit.map(|fit| Tested { gain: fit.gain, of_choice: None, chance: Some(chance), is_of_family: false });
         let (shown, without) = match (fit, leading) {
-            (Some(fit), _) => (self.shown(&(&fit.signal / fit.amplitude)), self.less(&fit.signal)),
+            (Some(fit), _) => (self.shown(&(&fit.signal / fit.alternative.amplitude.0)), self.less(&fit.signal)),
             (None, Cause::Unmodelled(Discrepancy { at: Location::FirstFrames { from, to }, .. })) => {
-                (self.shown(&signals.of_former_orbit()), self.without_first_frames(*from, *to))
+                (self.shown(&self.signals.of_former_orbit()), self.without_first_frames(*from, *to))
             }
             (None, Cause::Unmodelled(Discrepancy { at: Location::UnsteadyCorrector(c), .. })) => {
-                let unsteady = Unsteady::from_response(&self.differences, &self.white, signals.of_corrector(*c))?;
+                let unsteady = Unsteady::from_response(&self.differences, &self.white, self.signals.of_corrector(*c))?;
                 (unsteady.shown(&self.readings, |frame| is_on(self.campaign, *c, frame)), self.without_corrector(*c))
             }
             (None, _) => return None,
@@ -272,12 +269,13 @@ impl<'c> SettingDifferences<'c> {
             let evidence = Evidence::from_score(slope.dot(white) / spread, slope.norm_squared() / spread, width(term));
             evidence.log_bayes_factor + self.log_prior(term)
         };
-        let of_unmodelled = self.stretch(white).log_bayes + log_prior_unmodelled();
+        let of_unmodelled = self.stretch(white).0 + log_prior_unmodelled(ODDS, 1);
         slopes.iter().zip(&self.terms).map(of_term).chain([of_unmodelled]).collect()
     }
 
-    /// A share of the former orbit in a stretch of the campaign, averaged over its size and over all stretches of runs.
-    fn stretch(&self, white: &DMatrix<f64>) -> Stretch {
+    /// `ln` Bayes factor of a share of the former orbit in a stretch of the campaign, averaged over its size and over all stretches of runs; first and last
+    /// frame of the likeliest stretch, and its share.
+    fn stretch(&self, white: &DMatrix<f64>) -> (f64, (usize, usize), f64) {
         let runs = &self.differences.runs;
         let mut sums = vec![(0.0, 0.0)];
         for run in runs {
@@ -295,19 +293,19 @@ impl<'c> SettingDifferences<'c> {
         let all: Vec<(f64, (usize, usize), f64)> = each.map(weigh).collect();
         let best = all.iter().copied().fold((f64::NEG_INFINITY, (0, 0), 0.0), |a, b| if b.0 > a.0 { b } else { a });
         let mean = all.iter().map(|one| (one.0 - best.0).exp()).sum::<f64>() / all.len() as f64;
-        Stretch { log_bayes: best.0 + mean.ln(), frames: best.1, share: best.2 }
+        (best.0 + mean.ln(), best.1, best.2)
     }
 
     /// The share of the former orbit, its size that in the readings; none where what some monitors show does not predict the others, as where
     /// one reading jumps.
-    fn former_orbit(&self, signals: &Signals) -> Option<Discrepancy> {
-        let Stretch { log_bayes, frames: (from, to), share } = self.stretch(&self.white);
+    fn former_orbit(&self) -> Option<Discrepancy> {
+        let (log_bayes, (from, to), share) = self.stretch(&self.white);
         let (signal, data) = (self.former.rows_range(from..=to), self.white.rows_range(from..=to));
         let monitors = (0..signal.ncols()).map(|b| (0..signal.nrows(), b..b + 1));
         if !is_validated(held_out(&signal, &data, share, monitors)) {
             return None;
         }
-        let orbit = signals.of_former_orbit();
+        let orbit = self.signals.of_former_orbit();
         let some: Vec<f64> = orbit.rows_range(from..=to).iter().copied().filter(|x| *x != 0.0).collect();
         let rms = (some.iter().map(|x| x * x).sum::<f64>() / some.len().max(1) as f64).sqrt();
         let at = Location::FirstFrames { from, to };
@@ -315,10 +313,10 @@ impl<'c> SettingDifferences<'c> {
     }
 
     /// Each corrector as one that is unsteady, by whitened readings, where these confirm it.
-    fn unsteady(&self, signals: &Signals, white: &DMatrix<f64>) -> Vec<Discrepancy> {
+    fn unsteady(&self, white: &DMatrix<f64>) -> Vec<Discrepancy> {
         let correctors = driven(self.campaign);
         let judged = |&c: &usize| {
-            let unsteady = Unsteady::from_response(&self.differences, white, signals.of_corrector(c))?;
+            let unsteady = Unsteady::from_response(&self.differences, white, self.signals.of_corrector(c))?;
             unsteady.judge(c, |frame| is_on(self.campaign, c, frame), correctors.len())
         };
         correctors.iter().filter_map(judged).collect()
@@ -357,10 +355,11 @@ impl<'c> SettingDifferences<'c> {
         let spread = self.spread_of(term);
         let gained = (self.white.norm_squared() - left.norm_squared()) / spread;
         let evidence = Evidence::about(amplitude, gained, slope.norm_squared() / spread, width);
-        let (log_bayes, sigma) = (evidence.log_bayes_factor, evidence.sigma);
+        let amplitude_and_error = (amplitude, evidence.sigma);
+        let alternative = Alternative::unfitted(Cause::Effect(term), evidence.log_bayes_factor, amplitude_and_error);
         let runs = self.differences.runs.iter().map(|run| (run.clone(), 0..slope.ncols()));
         let gain = held_out(&slope.as_view(), &(&left + &slope * amplitude).as_view(), width, runs);
-        Fit { at, term, amplitude, sigma, log_bayes, gain, signal }
+        Fit { at, alternative, gain, signal }
     }
 
     /// Probability that the best of all is as good where another frame of each run takes the place of the first.
@@ -431,12 +430,6 @@ impl<'c> SettingDifferences<'c> {
             recording.rows[moved].iter_mut().for_each(|row| row.reading.fill(None));
         }
         recording
-    }
-}
-
-impl Fit {
-    fn alternative(&self) -> Alternative {
-        Alternative::unfitted(Cause::Effect(self.term), self.log_bayes, (self.amplitude, self.sigma))
     }
 }
 
@@ -512,10 +505,6 @@ fn is_validated((gain, sigma): (f64, f64)) -> bool {
     gain > VALIDATED * sigma
 }
 
-fn log_prior_unmodelled() -> f64 {
-    (UNMODELLED_SEEN * ODDS / SORTS as f64).ln()
-}
-
 fn width(term: Term) -> f64 {
     term.kind.prior_scale().expect("a share")
 }
@@ -526,7 +515,7 @@ mod tests {
     use twin::{Cycle, Effect};
 
     use super::*;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, simulated, template};
 
     fn found(effects: &[&str], seed: u64, change: impl Fn(&mut Coloured)) -> (Ring, Vec<Transient>) {
         let (ring, recording) = template();
@@ -603,11 +592,8 @@ mod tests {
     #[test]
     #[cfg_attr(debug_assertions, ignore = "minutes without optimisation")]
     fn all_correctors_that_settle_are_one_cause_and_their_first_frames_are_left_out() {
-        let (ring, recording) = template();
-        let hardware = inference::simulate::Hardware::shipped(&ring, &recording);
-        let truth = inference::simulate::Truth { vars: &[1.0; 48], beyond: &[&Settling(0.05)], ..Default::default() };
-        let made = inference::simulate::campaign(&recording, &ring, &truth, &hardware, 8).unwrap();
-        let Transients { found, campaign } = Transients::find(&ring, &made).unwrap();
+        let made = simulated(&[1.0; 48], &[], &[&Settling(0.05)], 8);
+        let Transients { found, campaign } = Transients::find(&template().0, &made).unwrap();
         assert_eq!(found.len(), 1);
         let Cause::Unmodelled(one) = &found[0].alternatives[0].cause else { panic!("{:?}", found[0].alternatives[0]) };
         let Location::FirstFrames { from, to } = one.at else { panic!("{:?}", one.at) };

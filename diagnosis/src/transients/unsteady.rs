@@ -14,8 +14,8 @@ use core::ops::Range;
 use evidence::log_bayes_factor_of_alike;
 use nalgebra::{DMatrix, DVector};
 
+use super::Shown;
 use super::differences::Differences;
-use super::shown::Shown;
 use crate::discrepancy::{Discrepancy, SIZES};
 use crate::location::Location;
 
@@ -155,12 +155,11 @@ mod tests {
     use inference::simulate::Beyond;
     use rand::SeedableRng;
     use rand::rngs::StdRng;
-    use rand_distr::{Distribution, StandardNormal};
     use twin::Cycle;
 
     use super::*;
     use crate::alternatives::Cause;
-    use crate::testing::{Coloured, template};
+    use crate::testing::{Coloured, normal, template};
     use crate::transients::Transients;
 
     /// A corrector whose kick is off by a share that depends on the frame.
@@ -227,7 +226,7 @@ mod tests {
             let mut random = StdRng::seed_from_u64(3);
             let monitors = made.dispersion.len();
             made.common = DMatrix::from_fn(recording.rows.len(), monitors, |i, _| {
-                let draw: f64 = StandardNormal.sample(&mut random);
+                let draw = normal(&mut random);
                 if frames.contains(&i) { 3.0 * made.noise * draw } else { 0.0 }
             });
         };

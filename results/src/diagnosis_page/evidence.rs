@@ -3,6 +3,8 @@
 use diagnosis::{Diagnosis, FitError, correction_of, corrections, scan, scan_discrepancies};
 use report::{Axes, Figure, Ranked, Section};
 
+use super::location::short;
+
 /// Causes shown.
 const LEADING: usize = 15;
 
@@ -25,7 +27,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Section, FitError> {
     let discrepancies = scan_discrepancies(data, null, f64::INFINITY)?;
     let sites = discrepancies.len();
     let unmodelled = discrepancies.iter().map(|one| {
-        let label = format!("unmodelled: {}", one.at.short(data));
+        let label = format!("unmodelled: {}", short(&one.at, data));
         Ranked { label, group: 1, value: one.log_bayes, threshold: Some(correction_of(one)) }
     });
     let mut all: Vec<Ranked> = library.chain(unmodelled).collect();

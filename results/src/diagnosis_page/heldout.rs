@@ -43,7 +43,7 @@ fn scores(caption: &str, before: &Score, after: &Score) -> Table {
     let row = |name: &str, one: &Score, gain: String| {
         [
             name.to_owned(),
-            one.readings().to_string(),
+            one.log_density.len().to_string(),
             format!("{:.1}", one.rms * 1e6),
             format!("{:.1}", one.elpd()),
             gain,
@@ -56,7 +56,7 @@ fn scores(caption: &str, before: &Score, after: &Score) -> Table {
     if !same {
         rows.push(row("with the effects found", after, format!("{} ± {error:.1}", signed(gain, 1))));
     }
-    let n = before.readings();
+    let n = before.log_density.len();
     let empty = String::new();
     rows.push([
         "expected of correct error bars".into(),

@@ -21,7 +21,7 @@ pub fn section(diagnosis: &Diagnosis, recording: &Recording) -> Result<Section, 
         recording.name,
         recording.rows.len(),
         recording.header.recorded_with,
-        found.data.mean_noise() * 1e6,
+        found.data.mean_noise * 1e6,
     );
     let row = |name: &str, how: String| [name.to_owned(), how];
     let rows = vec![

@@ -11,6 +11,7 @@ mod heldout;
 mod imperfections;
 mod lattice;
 mod limits;
+mod location;
 mod method;
 mod monitors;
 mod optics;
@@ -190,7 +191,7 @@ mod tests {
         assert!((first - 100.0 * finding.probability).abs() < 1e-9);
         // tunes are those that the fit predicts
         let data = diagnosis.found.best.data(&diagnosis.found.data);
-        let (machine, drives) = diagnosis.found.best.machine(data).unwrap();
+        let (machine, drives) = diagnosis.found.best.machine(data, 0).unwrap();
         let (_, tunes, _) = machine.readings(&drives).unwrap();
         let [x, y] = data.tune_shift_of_orbit;
         let rows = &section(&page, "Optics of the fitted machine").tables[0].rows;

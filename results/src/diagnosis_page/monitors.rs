@@ -23,7 +23,7 @@ pub fn section(diagnosis: &Diagnosis) -> Section {
             ]
         })
         .collect();
-    let expected = data.mean_noise() * 1e6;
+    let expected = data.mean_noise * 1e6;
     let text = match rows.len() {
         0 => format!("All monitors that are read are in state ok; expected noise of a reading {expected:.0} µm."),
         _ => format!(

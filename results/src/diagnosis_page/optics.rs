@@ -3,7 +3,7 @@
 //! Error bars are those of everything that the fit may change in the ring: with `C` the covariance of those unknowns and `J` the derivatives
 //! of an optics function, `sigma^2 = J C J^T`.
 
-use diagnosis::{Data, Diagnosis, FitError, Fitted, Unknown};
+use diagnosis::{Data, Diagnosis, FitError, Fitted, Quantity, Unknown};
 use nalgebra::{DMatrix, DVector};
 use report::{Axes, Figure, Reference, Section, Series};
 use twin::{Class, EffectError, Hold, Optics, Tunes, Twiss};
@@ -54,18 +54,19 @@ impl Fit {
         let vars = fitted.params.len();
         let design = Functions::of(&Optics::of(&data.ring, Hold::Momentum { delta: 0.0 })?)?;
         let at = |u: &DVector<f64>| -> Result<DVector<f64>, EffectError> {
-            let (machine, drives) = fitted.hypothesis.machine(data, &fitted.units.params(u), &u.as_slice()[vars..])?;
+            let (machine, drives) =
+                fitted.hypothesis.machine(data, 0, &fitted.units.params(u), &u.as_slice()[vars..])?;
             Ok(Functions::of(&machine.on_orbit(&drives.orbit).optics()?)?.against(&design))
         };
         let best = at(&fitted.u)?;
         let unknowns = fitted.hypothesis.unknowns(data);
-        let moves = |unknown: &Unknown| match unknown {
-            Unknown::Amplitude(i, _) => moves_optics(fitted.hypothesis.terms[*i].kind),
-            Unknown::Ordinary(member, _) => member.terms.first().is_some_and(|term| moves_optics(term.kind)),
+        let moves = |unknown: &Unknown| match &unknown.quantity {
+            Quantity::Amplitude(term) => moves_optics(term.kind),
+            Quantity::Ordinary(member) => member.terms.first().is_some_and(|term| moves_optics(term.kind)),
             // of first order, it is not in the machine
-            Unknown::Form(..) => false,
+            Quantity::Form(..) => false,
             // on which sextupoles focus
-            Unknown::Orbit(..) => true,
+            Quantity::Orbit(..) => true,
         };
         let free: Vec<usize> =
             (0..vars).chain((0..unknowns.len()).filter(|&i| moves(&unknowns[i])).map(|i| vars + i)).collect();

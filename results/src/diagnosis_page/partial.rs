@@ -36,7 +36,7 @@ impl<'f> Partial<'f> {
     pub fn beyond(data: &'f Data, fitted: &'f Fitted, less: &Hypothesis) -> Result<Self, FitError> {
         let data = fitted.data(data);
         let (vars, u) = (fitted.params.len(), fitted.guess(data, less));
-        let (machine, drives) = less.machine(data, &fitted.params, &u.as_slice()[vars..])?;
+        let (machine, drives) = less.machine(data, 0, &fitted.params, &u.as_slice()[vars..])?;
         let measured = data.residual(&diagnosis::predicted_by(data, less, 0, &u)?);
         let predicted = &measured - fitted.residual_of(data)?.rows(0, data.size());
         let of_element =

@@ -51,7 +51,7 @@ pub fn section(diagnosis: &Diagnosis) -> Result<Option<Section>, FitError> {
 }
 
 fn stated(scan: &PlaceScan, interval: &[Interval], word: &str, symbol: &str, label: &str) -> String {
-    let peak = scan.peak();
+    let peak = scan.segments[scan.peak()];
     let list = if interval.len() > STRETCHES {
         let whole: f64 = interval.iter().map(|one| (one.to_m - one.from_m).max(0.0)).sum();
         format!("{} stretches of the ring, {whole:.0} m in all", interval.len())
@@ -62,18 +62,19 @@ fn stated(scan: &PlaceScan, interval: &[Interval], word: &str, symbol: &str, lab
     format!(
         "In place of {label}, a thin {word} gradient is most likely at s = {:.2} m, with {symbol} = {} /m; 95 % credible interval of its \
          place: {}.",
-        scan.segments[peak].s,
-        signed(scan.amplitude[peak], 4),
+        peak.s,
+        signed(peak.amplitude, 4),
         list
     )
 }
 
 fn figure(diagnosis: &Diagnosis, scan: &PlaceScan, word: &str) -> (String, Figure) {
     let s: Vec<f64> = scan.segments.iter().map(|segment| segment.s).collect();
-    let mut series = vec![Series::line(&format!("thin {word} gradient"), s.clone(), scan.log_bayes.clone())];
+    let log_bayes = scan.segments.iter().map(|segment| segment.log_bayes).collect();
+    let mut series = vec![Series::line(&format!("thin {word} gradient"), s.clone(), log_bayes)];
     let height = |at: f64| {
         let nearest = (0..s.len()).min_by(|&i, &j| (s[i] - at).abs().total_cmp(&(s[j] - at).abs()));
-        nearest.map_or(f64::NAN, |i| scan.log_bayes[i])
+        nearest.map_or(f64::NAN, |i| scan.segments[i].log_bayes)
     };
     let acts_alike = |one: &Finding| one.term().is_some_and(|term| term.kind.thin() == Some(scan.kind));
     let marks = diagnosis.findings.iter().flat_map(|finding| {
@@ -91,8 +92,8 @@ fn figure(diagnosis: &Diagnosis, scan: &PlaceScan, word: &str) -> (String, Figur
             series.push(Series::points(label, x, y));
         }
     }
-    let peak = scan.peak();
-    let (best, at) = (scan.log_bayes[peak], scan.segments[peak].s);
+    let peak = scan.segments[scan.peak()];
+    let (best, at) = (peak.log_bayes, peak.s);
     let title = match best > 0.0 {
         true => format!("A thin {word} gradient gains most at s = {at:.1} m: {best:.0} nat"),
         false => format!("A thin {word} gradient gains nothing anywhere"),
@@ -101,8 +102,8 @@ fn figure(diagnosis: &Diagnosis, scan: &PlaceScan, word: &str) -> (String, Figur
     let axes = axes.along(strip(diagnosis));
     let caption = format!(
         "ln Bayes factor of a thin {word} gradient against none, over its place; largest at s = {:.2} m, near {}{}. {STRIP}",
-        scan.segments[peak].s,
-        nearest(&diagnosis.found.data.ring, scan.segments[peak].s),
+        at,
+        nearest(&diagnosis.found.data.ring, at),
         if series.len() > 1 {
             "; markers are findings and alternatives that act like one, at the height of the curve"
         } else {
@@ -121,9 +122,9 @@ fn nearest(ring: &Ring, s: f64) -> &str {
 
 /// The posterior of the place near its peak: all of it, and the part within the interval.
 fn density(diagnosis: &Diagnosis, scan: &PlaceScan, interval: &[Interval], word: &str) -> (String, Figure) {
-    let (peak, circumference) = (scan.peak(), diagnosis.found.data.ring.circumference);
-    let (middle, largest) = (scan.segments[peak].s, scan.log_bayes[peak]);
-    let weight = |i: usize| (scan.log_bayes[i] - largest).exp();
+    let (peak, circumference) = (scan.segments[scan.peak()], diagnosis.found.data.ring.circumference);
+    let (middle, largest) = (peak.s, peak.log_bayes);
+    let weight = |i: usize| (scan.segments[i].log_bayes - largest).exp();
     let sum: f64 = (0..scan.segments.len()).map(|i| weight(i) * scan.segments[i].length).sum();
     // s relative to the peak, since the interval may cross the start of the ring
     let s = |i: usize| scan.segments[i].s - circumference * ((scan.segments[i].s - middle) / circumference).round();

@@ -1,8 +1,9 @@
 //! The probabilities of the causes: bars that add up to 1.
 
-use diagnosis::{Alternative, Cause, Competition, Data, Diagnosis, Finding, capitalised};
+use diagnosis::{Alternative, Cause, Competition, Data, Diagnosis, Finding, capitalised, imitating};
 use report::{Axes, Figure, Ranked, Section};
 
+use super::location::short;
 use super::slope::name;
 
 /// Causes with a bar of their own.
@@ -65,8 +66,9 @@ fn bars(data: &Data, competition: &Competition, nothing: &str) -> Vec<Ranked> {
     let shown = competition.alternatives.iter().filter(|one| one.probability > LEAST).take(SHOWN);
     let mut bars: Vec<Ranked> =
         shown.map(|one| bar(label(data, one), usize::from(!one.is_of_library()), one.probability)).collect();
-    if competition.imitating() > LEAST {
-        bars.push(bar("unknown, and looks like an effect".into(), 1, competition.imitating()));
+    let imitating = imitating(competition.library());
+    if imitating > LEAST {
+        bars.push(bar("unknown, and looks like an effect".into(), 1, imitating));
     }
     if competition.too_small > LEAST {
         bars.push(bar("unknown, and too small to be seen".into(), 1, competition.too_small));
@@ -82,7 +84,7 @@ fn label(data: &Data, one: &Alternative) -> String {
         Cause::Effect(term) => {
             format!("{} {}", term.kind.word().replace('_', " "), term.site.name(&data.ring)).trim_end().to_owned()
         }
-        Cause::Unmodelled(discrepancy) => discrepancy.at.short(data),
+        Cause::Unmodelled(discrepancy) => short(&discrepancy.at, data),
     }
 }
 

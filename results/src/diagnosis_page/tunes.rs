@@ -19,7 +19,7 @@ struct Predicted(String, RangeInclusive<f64>);
 /// # Errors
 /// [`FitError`].
 pub fn figures(finding: &Finding, partial: &Partial) -> Result<Vec<(String, Figure)>, FitError> {
-    let (machine, drives) = partial.fitted.machine(partial.data)?;
+    let (machine, drives) = partial.fitted.machine(partial.data, 0)?;
     let with = ends(&machine, &drives)?;
     let of_plane = |plane: usize| {
         let models = [
@@ -36,7 +36,7 @@ pub fn figures(finding: &Finding, partial: &Partial) -> Result<Vec<(String, Figu
 /// # Errors
 /// [`FitError`].
 pub fn of_model(data: &Data, fitted: &Fitted, what: &str) -> Result<Vec<(String, Figure)>, FitError> {
-    let (machine, drives) = fitted.machine(data)?;
+    let (machine, drives) = fitted.machine(data, 0)?;
     let ends = ends(&machine, &drives)?;
     let of_plane = |plane: usize| figure(data, fitted, plane, &[Predicted("model".into(), ends[plane].clone())], what);
     [0, 1].into_iter().filter_map(|plane| of_plane(plane).transpose()).collect()
@@ -94,7 +94,7 @@ struct Reading {
 
 /// Measured tunes with their integer part.
 fn readings(data: &Data, fitted: &Fitted, plane: usize) -> Result<Vec<Reading>, FitError> {
-    let predicted = fitted.predicted(data)?;
+    let predicted = fitted.predicted(data, 0)?;
     let (column, miss) = (data.monitors() + plane, data.miss(&predicted));
     let of = |(pool, readings): (usize, f64)| Reading {
         time: data.drives.time[pool],

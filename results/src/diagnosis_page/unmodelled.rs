@@ -158,7 +158,7 @@ impl Left<'_> {
 
     /// Predicted readings of a monitor about their mean [mm].
     fn positions(&self, b: usize) -> Result<DVector<f64>, FitError> {
-        let column = self.partial.fitted.predicted(self.partial.data)?.column(b) * 1e3;
+        let column = self.partial.fitted.predicted(self.partial.data, 0)?.column(b) * 1e3;
         Ok(column.add_scalar(-column.mean()))
     }
 
@@ -244,7 +244,7 @@ impl Left<'_> {
         for one in &self.residuals {
             runs[one.pool].add(one.value, 1e6 * does.readings[(one.pool, one.monitor)] / one.noise);
         }
-        let miss = data.miss(&fitted.predicted(data)?);
+        let miss = data.miss(&fitted.predicted(data, 0)?);
         for (plane, noise) in [0, 1].into_iter().filter_map(|plane| Some((plane, data.tune_noise(plane)?))) {
             for (run, readings) in data.tune_pools(plane) {
                 let sigma = noise / readings.sqrt();
@@ -305,7 +305,7 @@ impl Left<'_> {
     /// Response of the read monitors to a kick at a quadrupole [m/rad].
     fn response_to(&self, q: usize, plane: Plane) -> Result<DVector<f64>, FitError> {
         let (data, fitted) = (self.partial.data, self.partial.fitted);
-        let (machine, _) = fitted.machine(data)?;
+        let (machine, _) = fitted.machine(data, 0)?;
         let optics = Optics::of(machine.ring(), Hold::Momentum { delta: 0.0 })?;
         let direction = if plane == Plane::X { [1.0, 0.0] } else { [0.0, 1.0] };
         let source = optics.kick(data.ring.quadrupoles[q].element, direction);

@@ -2,7 +2,7 @@
 //!
 //! Machine file and campaigns by pyAT are read from `../shared` beside the checkout; a test that finds none says so and passes.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use diagnosis::{Diagnosis, Finding, Verdict};
 use inference::stream::{self, Walk};
@@ -10,15 +10,16 @@ use inference::{BaseModel, BaseTerm, BatchFit, Campaign, Imitation, Recording, T
 use nalgebra::{DMatrix, DVector};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
-use serde_json::{Value, json};
-use twin::{BUILT_IN, Hold, Optics, Ring};
+use serde_json::Value;
+use system_tests::repository;
+use twin::{Hold, Optics, Ring};
 
 /// K2L of a dipole of the deck [1/m2], which the former ring lacks.
 const SEXTUPOLE: f64 = -0.0320 * 2.42;
 const CAMPAIGNS: [&str; 3] = ["paper-vars", "random-vars", "paper-like"];
 
 fn shared(path: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared").join(path);
+    let path = repository("../shared").join(path);
     if !path.exists() {
         println!("skipped: no {}", path.display());
     }
@@ -42,15 +43,6 @@ fn truth(ring: &Ring, name: &str) -> Vec<f64> {
     ring.var_names().iter().map(|var| truth["vars"][var].as_f64().unwrap()).collect()
 }
 
-/// The built-in machine file: the deck's supply law, and nothing that follows from it.
-fn powered() -> Value {
-    serde_json::from_str(BUILT_IN[0].1).unwrap()
-}
-
-fn parsed(machine: &Value) -> Result<Ring, String> {
-    Ring::parse(&machine.to_string(), "booster-deck.json").map_err(|error| error.to_string())
-}
-
 #[test]
 fn tunes_and_strengths_follow_from_the_published_read_backs() {
     let ring = Ring::booster();
@@ -62,17 +54,9 @@ fn tunes_and_strengths_follow_from_the_published_read_backs() {
     assert_eq!(ring.elements.len(), deck.elements.len());
 }
 
-#[test]
-fn what_the_file_states_beside_the_law_has_to_be_its_own() {
-    let mut machine = powered();
-    machine["k1"] = json!({"QV": -0.56});
-    let refused = parsed(&machine).unwrap_err();
-    assert!(refused.starts_with("QV_A1: expected the k1 of currents, found -0.56 stated and -0.56085"), "{refused}");
-}
-
 /// The campaign of the repository: main current and trims as they are read.
 fn raw() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/paper-vars")
+    repository("recordings/paper-vars")
 }
 
 /// The header in format 2, without lines of these keys.

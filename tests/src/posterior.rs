@@ -1,4 +1,4 @@
-//! The posterior of vars and amplitudes of a hypothesis, sampled by NUTS to validate the Gaussian of [`super::fit`].
+//! The posterior of vars and amplitudes of a hypothesis, sampled by NUTS to validate the Gaussian of its fit.
 //!
 //! In units of prior standard deviations, `-cost/2` is the log-density of u. The vars have coordinates w without bounds (see
 //! [`inference::Bounded`]), and all of them those of the Gaussian: `w = best + L^-T z`, `L L^T` the curvature in w.
@@ -6,12 +6,10 @@
 use core::ops::ControlFlow;
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, DVector};
-
-use super::data::Data;
-use super::fit::Fitted;
+use diagnosis::{Data, Fitted};
 use inference::Bounded;
 use inference::nuts::{Density, NutsError, NutsRun, NutsSettings, Unstable, explore};
+use nalgebra::{DMatrix, DVector};
 
 /// A fitted hypothesis, its density sampled.
 struct Extended {
