@@ -14,9 +14,8 @@
 use core::ops::Range;
 
 use nalgebra::DMatrix;
-use twin::{Measured, Unit};
+use twin::{Measured, Unit, median};
 
-use super::median::upper_median;
 use inference::{Imperfection, Measure};
 
 /// Frames in which the noise of all monitors is larger.
@@ -293,7 +292,7 @@ fn dispersion(of_frame: &[Sums]) -> f64 {
         let expected = 2.0 / pair[0].count + 2.0 / pair[1].count;
         (pair[0].variance() / pair[1].variance()).ln().powi(2) / expected
     });
-    upper_median(differ).map_or(1.0, |median| (median / MEDIAN).max(1.0))
+    median(differ).map_or(1.0, |median| (median / MEDIAN).max(1.0))
 }
 
 #[cfg(test)]

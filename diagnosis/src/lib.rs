@@ -40,7 +40,6 @@ mod limits;
 mod linearisation;
 mod location;
 mod lost_frames;
-mod median;
 mod memory;
 mod modes;
 mod noise;

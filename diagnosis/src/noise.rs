@@ -15,13 +15,12 @@ use core::ops::Range;
 
 use estimator::MonitorState;
 use nalgebra::{DMatrix, DVector};
-use twin::{Measured, Unit};
+use twin::{Measured, Unit, median};
 
 use super::columns::beside;
 use super::frame_pattern::{self, Found, FrameToFrame, Known, Like, Shape};
 use super::jitter::{CRATE, Crate, Differences, groups, with_crates};
 use super::levels::{Levels, Part};
-use super::median::upper_median;
 use super::memory::Memory;
 use super::odds::{SUSPICIOUS, correction_of_sort};
 use super::period::Period;
@@ -176,7 +175,7 @@ impl Noise {
     fn at_weights(self, campaign: &Campaign) -> Self {
         let header = &campaign.recording.header.noise;
         let scales = self.own.iter().zip(header).map(|(own, header)| own / header);
-        let value = upper_median(scales).unwrap_or(1.0);
+        let value = median(scales).unwrap_or(1.0);
         Self { common_scale: Measured { value, sigma: 0.0 }, ..self }
     }
 

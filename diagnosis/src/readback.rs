@@ -5,8 +5,8 @@
 //! it is off in these frames; in the others, with the median of itself. What lies more than half of the largest setting away contradicts: that is
 //! halfway between a corrector that is set and one that is not.
 
-use super::median::upper_median;
 use inference::recording::{Recording, Row};
+use twin::median;
 
 /// Share of a corrector's largest setting that separates set from not set.
 const HALF: f64 = 0.5;
@@ -41,7 +41,7 @@ fn contradicting(recording: &Recording, corrector: usize) -> Vec<(usize, f64)> {
     }
     let [set, idle] = [true, false].map(|is_set| {
         let alike = recording.rows.iter().filter(|row| row.setting(corrector).is_some() == is_set);
-        upper_median(alike.map(off)).unwrap_or_default()
+        median(alike.map(off)).unwrap_or_default()
     });
     let size = |row: &Row| (off(row) - if row.setting(corrector).is_some() { set } else { idle }).abs();
     recording.rows.iter().map(size).enumerate().filter(|(_, size)| *size > HALF * amplitude).collect()

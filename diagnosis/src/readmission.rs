@@ -8,8 +8,8 @@
 use estimator::MonitorState;
 use inference::{Campaign, Exclusions, Screened};
 
-use super::median::upper_median;
 use super::noise::{Noise, Source};
+use twin::median;
 
 /// Standard deviations of the noise within which a reading is taken back, where the level is larger and where it is ordinary: there a small jump is
 /// further away.
@@ -70,7 +70,7 @@ fn ordinary_noise(campaign: &Campaign, noise: &Noise, b: usize) -> f64 {
 /// Median of what a monitor's readings that count leave, not a number without any.
 fn middle(source: &Source, b: usize) -> f64 {
     let frames = (0..source.campaign.frames()).filter(|&frame| source.campaign.counts(frame, b));
-    upper_median(frames.map(|frame| source.residual[(frame, b)])).unwrap_or(f64::NAN)
+    median(frames.map(|frame| source.residual[(frame, b)])).unwrap_or(f64::NAN)
 }
 
 /// True for a reading that is the same as the one before or after.

@@ -6,10 +6,9 @@
 //!
 //! Source: A. Gelman et al., Bayesian Data Analysis (2013), ch. 5.4, the hierarchical normal model; E. B. Wilson and M. M. Hilferty, PNAS 17 (1931) 684.
 
-use twin::Measured;
+use twin::{Measured, median};
 
 use super::half_normal::HalfNormal;
-use super::median::upper_median;
 
 /// Scales of the monitors.
 #[derive(Debug, Clone, PartialEq)]
@@ -129,7 +128,7 @@ fn by_chance(one: &Measured, down: bool) -> f64 {
 
 /// Their median.
 fn centre_of(all: &[Measured]) -> f64 {
-    upper_median(all.iter().map(|one| one.value)).unwrap_or(0.0)
+    median(all.iter().map(|one| one.value)).unwrap_or(0.0)
 }
 
 #[cfg(test)]
