@@ -389,8 +389,11 @@ impl Text<'_> {
 
     /// Machine and lattice have to be the ring's, whatever else may be wrong: the header of another one lacks this one's supplies.
     fn check_names(&self, ring: &Ring) -> Result<(), RecordingError> {
-        let machine = word(self.text, "machine").filter(|name| !begins(&ring.name, name));
-        let lattice = word(self.text, "lattice").filter(|file| *file != ring.file);
+        // what cannot be read the strict reading refuses
+        let stated: toml::Table = self.text.parse().unwrap_or_default();
+        let word = |key: &str| stated.get(key)?.as_str();
+        let machine = word("machine").filter(|name| !begins(&ring.name, name));
+        let lattice = word("lattice").filter(|file| *file != ring.file);
         let other = machine.map(|name| ("machine", &ring.name, name));
         match other.or_else(|| lattice.map(|file| ("lattice", &ring.file, file))) {
             Some((key, expected, found)) => self.other_machine(key, format!("{expected:?}"), format!("{found:?}")),
@@ -511,11 +514,7 @@ pub(super) fn kinetic_energy(text: &str) -> Option<f64> {
 
 /// The lattice that a header names; none likewise.
 pub(super) fn lattice(text: &str) -> Option<String> {
-    word(text, "lattice")
-}
-
-fn word(text: &str, key: &str) -> Option<String> {
-    Some(value(text, key)?.as_str()?.to_owned())
+    Some(value(text, "lattice")?.as_str()?.to_owned())
 }
 
 fn value(text: &str, key: &str) -> Option<toml::Value> {
