@@ -177,7 +177,7 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
         let ordinary = family.with_scale(family.ordinary);
         // errors that are alike along rows and columns tell less than independent ones
         let widening = median(family.members.iter().map(|&member| changed.uncertainty.widening(member)));
-        let widening = widening.expect("a family that is learnt has members");
+        let widening = widening.expect("it has members");
         let evidence = family.log_evidence(&marginal).zip(ordinary.log_evidence(&marginal));
         let gain = evidence.map_or(0.0, |(learnt, ordinary)| learnt - ordinary) / widening;
         if gain > DECISIVE {

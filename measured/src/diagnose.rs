@@ -362,7 +362,7 @@ fn imperfections(hierarchy: &Hierarchy) -> Vec<Imperfection> {
             mean: family.mean(&hierarchy.off_priors()) * width,
             scatter: family.variance().sqrt() * width,
             ordinary: family.ordinary_scatter() * width,
-            sigma: sigma.expect("a family that is learnt has members"),
+            sigma: sigma.expect("it has members"),
         }
     });
     told.collect()

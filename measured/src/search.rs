@@ -11,7 +11,7 @@
 //! `ln t_1(g/G; v + 1) - ln t_k(g/G; v)`.
 //!
 //! A scatter told by `n` others, and by what is ordinary, has heavier tails than a normal one: Student's, with `k = n v^2/s^4` degrees of freedom (F. E. Satterthwaite, Biometrics 2 (1946)
-//! 110). What stands out has any size, Cauchy's density about the prior's width (A. Zellner and A. Siow, Trabajos de Estadistica 31 (1980) 585).
+//! 110); that of skew quadrupoles, which are set one by one, is that of an ordinary ring. What stands out has any size, Cauchy's density about the prior's width (A. Zellner and A. Siow, Trabajos de Estadistica 31 (1980) 585).
 //!
 //! Of the members that stand out, the one that explains most of the data is released, then the others adapt, and so on; those that it takes the gain from are its
 //! alternatives. What a member explains is the same ratio of two normal densities, with independent errors, over the largest widening of those that stand out, and its
