@@ -201,7 +201,7 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
 fn is_told_alone(changed: &Hierarchy, number: usize) -> bool {
     let is_alone = match changed.unknowns[number].kind {
         Kind::Strength(_) => changed.classes[number] == ALL,
-        Kind::RfScale | Kind::Wiggler(_) | Kind::Added(_) => true,
+        Kind::RfScale | Kind::Wiggler(_) | Kind::TiltedWiggler(_) | Kind::Added(_) => true,
         _ => false,
     };
     // beside what those of its kind change where nothing was changed
@@ -225,7 +225,7 @@ fn other(folder: &Folder, changed: &Hierarchy, number: usize) -> Other {
     let kind = changed.unknowns[number].kind;
     let (change, sigma) = change(changed, number);
     let unit = match kind {
-        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) => "1/m",
+        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::TiltedWiggler(_) => "1/m",
         Kind::Added(_) => "1/m^2",
         _ => "",
     };
@@ -274,7 +274,7 @@ fn gradients(folder: &Folder, before: &Hierarchy, changed: &Hierarchy) -> Vec<Ch
 mod tests {
     use super::*;
     use crate::testing::{NOISE, machine, measured, normal, ring};
-    use crate::unknowns::{Focusing, Unknown, straights};
+    use crate::unknowns::{Unknown, fields_along, straights};
 
     #[test]
     fn changes_are_found_within_their_error_bars_where_the_model_errs_alike() {
@@ -307,9 +307,9 @@ mod tests {
         assert!(found.iter().all(|one| one.sigma < 0.003), "{found:?}");
     }
 
-    /// A wiggler of 0.2 /m whose poles are 3 cm off the middle of its straight: the quadrupoles on both sides are as they were.
+    /// A wiggler of 0.2 /m whose poles are tilted and 3 cm off the middle of its straight: the magnets on both sides are as they were.
     #[test]
-    fn a_wiggler_off_the_middle_of_its_straight_is_no_quadrupole() {
+    fn a_tilted_wiggler_off_the_middle_of_its_straight_is_no_magnet_beside_it() {
         let ring = ring();
         let truth = machine(&ring, 5);
         let before = measured(&ring, &truth, NOISE, 1);
@@ -318,16 +318,19 @@ mod tests {
         let (place, straight) = (strengths.len() + skews.len(), straights(&ring).swap_remove(3));
         let groups = [strengths, skews, Vec::new(), vec![straight.clone()]];
         let model = Model::of(&ring, &groups, twin::Rf::FixedFrequency).unwrap();
-        let along = [Kind::Wiggler(0), Kind::Moment(Focusing::Gradient, 0), Kind::Moment(Focusing::Wiggler, 0)];
-        for (kind, value) in along.into_iter().zip([0.2, 0.0, 0.006]).rev() {
+        let (whole, moments) = ([0.2, 0.02], [0.0, 0.006, 0.0]);
+        let along: Vec<(Kind, f64)> = fields_along(1).zip(whole.into_iter().chain(moments)).collect();
+        for (kind, value) in along.into_iter().rev() {
             unknowns.insert(place, Unknown { kind, mean: 0.0, width: 0.1 });
             values = values.insert_row(place, value);
         }
         let after = measured(&ring, &(model, unknowns, values), NOISE, 2);
         let found = compare(&before, &after, &Settings::default(), &mut |_| ()).unwrap().1;
-        let [only] = found.others.as_slice() else { panic!("{found:?}") };
-        assert!(only.word == "wiggler_focusing" && only.at == ring.element(straight[straight.len() / 2]), "{only:?}");
-        assert!((only.change - 0.2).abs() < 4.0 * only.sigma && only.sigma < 0.01, "{only:?}");
+        assert!(found.others.len() == 2, "{found:?}");
+        for (one, (word, value)) in found.others.iter().zip([("wiggler_focusing", 0.2), ("skew_gradient", 0.02)]) {
+            assert!(one.word == word && one.at == ring.element(straight[straight.len() / 2]), "{one:?}");
+            assert!((one.change - value).abs() < 4.0 * one.sigma && one.sigma < 0.01, "{one:?}");
+        }
         assert!(found.gradients.iter().all(|one| !one.has_changed), "{found:?}");
     }
 

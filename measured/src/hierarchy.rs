@@ -21,7 +21,7 @@ use crate::model::{Model, Prediction};
 use crate::noise::Noise;
 use crate::normal::{Places, times};
 use crate::uncertainty::Uncertainty;
-use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, focusing_along, magnets, middle, straights, unknowns};
+use crate::unknowns::{Groups, Kind, Magnets, Unknown, Widths, fields_along, magnets, middle, straights, unknowns};
 
 /// Linearisations at most: the first begins at the fit, whose values differ from the last ones by what families take.
 const ROUNDS: usize = 10;
@@ -275,9 +275,11 @@ impl Hierarchy {
         start.settle(model, ROUNDS / 2, progress)
     }
 
-    /// True of what is released, and of a moment where the wiggler in its straight is.
+    /// True of what is released, and of what else a wiggler has in its straight where that is.
     fn is_freed(&self, number: usize, released: &[usize]) -> bool {
-        let Kind::Moment(_, straight) = self.unknowns[number].kind else { return released.contains(&number) };
+        let (Kind::Moment(_, straight) | Kind::TiltedWiggler(straight)) = self.unknowns[number].kind else {
+            return released.contains(&number);
+        };
         released.iter().any(|&other| self.unknowns[other].kind == Kind::Wiggler(straight))
     }
 
@@ -578,7 +580,7 @@ fn all_unknowns(folder: &Folder, groups: &Groups, settings: &Settings) -> Vec<Un
     let fitted = unknowns(folder, groups, true, &settings.widths);
     let (magnets, instruments) = fitted.split_at(groups[0].len() + groups[1].len());
     let gradients = (0..groups[2].len()).map(|group| Unknown { kind: Kind::Gradient(group), mean: 0.0, width: skew });
-    let along = focusing_along(groups[3].len()).map(|kind| {
+    let along = fields_along(groups[3].len()).map(|kind| {
         // a moment is as wide as a gradient, a metre off the middle
         let width = if matches!(kind, Kind::Wiggler(_)) { wiggler } else { skew };
         Unknown { kind, mean: 0.0, width }

@@ -14,7 +14,7 @@ use crate::derivative::{ByMachine, Change, Share};
 use crate::error::MeasuredError;
 use crate::folder::Folder;
 use crate::lattice::{lens_pairs, parts, ring, winding};
-use crate::unknowns::{Focusing, Groups, Kind, Unknown, focusing_along, gains};
+use crate::unknowns::{Groups, Kind, Unknown, fields_along, gains};
 
 /// Millimetres a metre.
 const MILLI: f64 = 1e3;
@@ -44,7 +44,7 @@ pub struct Model {
 /// Two lenses at one place of a straight.
 #[derive(Debug, Clone, Copy)]
 struct Pair {
-    /// Element that focuses as a gradient does.
+    /// Element with a gradient, or a skew gradient.
     gradient: usize,
     /// Element that focuses vertically.
     wiggler: usize,
@@ -267,7 +267,7 @@ impl Model {
         });
         let skews = (0..self.skews.len()).map(Kind::Skew);
         let gradients = (0..self.gradients.len()).map(Kind::Gradient);
-        let thin = skews.chain(gradients).chain(focusing_along(self.straights.len()));
+        let thin = skews.chain(gradients).chain(fields_along(self.straights.len()));
         strengths.chain(thin.map(|kind| self.thin(kind))).collect()
     }
 
@@ -278,8 +278,9 @@ impl Model {
         let (group, change) = match kind {
             Kind::Skew(group) => return each(&self.skews[group], Change::Skew),
             Kind::Gradient(group) => return each(&self.gradients[group], Change::Normal),
-            Kind::Wiggler(group) | Kind::Moment(Focusing::Wiggler, group) => (group, Change::Vertical),
-            Kind::Moment(Focusing::Gradient, group) => (group, Change::Normal),
+            Kind::Wiggler(group) => (group, Change::Vertical),
+            Kind::TiltedWiggler(group) => (group, Change::Skew),
+            Kind::Moment(change, group) => (group, change),
             _ => return Vec::new(),
         };
         let pairs = &self.straights[group];
@@ -288,7 +289,7 @@ impl Model {
             Kind::Moment(..) => pair.off / squares,
             _ => 1.0 / pairs.len() as f64,
         };
-        let element = |pair: &Pair| if change == Change::Normal { pair.gradient } else { pair.wiggler };
+        let element = |pair: &Pair| if change == Change::Vertical { pair.wiggler } else { pair.gradient };
         pairs.iter().map(|pair| (element(pair), change, share(pair))).collect()
     }
 
@@ -383,9 +384,10 @@ mod tests {
                 let shares = model.thin(kind).into_iter().zip(pairs);
                 shares.fold([0.0; 2], |[sum, first], ((_, _, share), pair)| [sum + share, first + share * pair.off])
             };
-            let along =
-                [Kind::Wiggler(group), Kind::Moment(Focusing::Gradient, group), Kind::Moment(Focusing::Wiggler, group)];
-            for (kind, expected) in along.into_iter().zip([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]]) {
+            let changes = [Change::Normal, Change::Vertical, Change::Skew];
+            let firsts = changes.map(|change| (Kind::Moment(change, group), [0.0, 1.0]));
+            let wholes = [Kind::Wiggler(group), Kind::TiltedWiggler(group)].map(|kind| (kind, [1.0, 0.0]));
+            for (kind, expected) in wholes.into_iter().chain(firsts) {
                 let found = moments(kind);
                 assert!((0..2).all(|order| (found[order] - expected[order]).abs() < 1e-12), "{kind:?}: {found:?}");
             }
@@ -407,8 +409,8 @@ mod tests {
         let straight = crate::unknowns::straights(&folder).swap_remove(0);
         let groups = [strengths, skews, vec![vec![4], vec![2]], vec![straight]];
         let model = Model::of(&folder, &groups, Rf::FixedFrequency).unwrap();
-        let along = [Kind::Wiggler(0), Kind::Moment(Focusing::Gradient, 0), Kind::Moment(Focusing::Wiggler, 0)];
-        for kind in [Kind::Gradient(0), Kind::Gradient(1)].into_iter().chain(along).rev() {
+        let thin: Vec<Kind> = [Kind::Gradient(0), Kind::Gradient(1)].into_iter().chain(fields_along(1)).collect();
+        for kind in thin.into_iter().rev() {
             unknowns.insert(place, Unknown { kind, mean: 0.0, width: 0.01 });
             values = values.insert_row(place, 0.004);
         }
