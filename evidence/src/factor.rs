@@ -1,19 +1,13 @@
-//! The Cholesky factor of a positive matrix, in blocks: the products of blocks, most of the work of large ones, are several times as fast as nalgebra's own
-//! factorisation and solution, which go column by column.
-//!
-//! Source: G. Golub and C. Van Loan, Matrix Computations (2013), ch. 4.2.9, recursive block Cholesky.
+//! The Cholesky factor of a positive matrix, and products of which half is made, by faer: nalgebra's go column by column and take several times as long.
 
+use faer::dyn_stack::{MemBuffer, MemStack};
+use faer::linalg::cholesky::llt::factor::{LltRegularization, cholesky_in_place, cholesky_in_place_scratch};
+use faer::linalg::matmul::triangular;
+use faer::linalg::triangular_inverse::invert_lower_triangular;
+use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::{Accum, MatMut, MatRef, Par};
 use nalgebra::allocator::Allocator;
-use nalgebra::{DMatrix, DMatrixView, DMatrixViewMut, DefaultAllocator, Dim, Dyn, Matrix, OMatrix, Storage};
-
-/// Rows that are solved column by column, and factorised so.
-const ROWS: usize = 48;
-const FACTORISED: usize = 160;
-/// Columns of a product of which half is left out.
-const COLUMNS: usize = 100;
-/// Columns up to which blocks are no gain, and from which on the inverse of a small block is one.
-const FEW: usize = 3;
-const MANY: usize = 96;
+use nalgebra::{DMatrix, DefaultAllocator, Dim, Dyn, Matrix, OMatrix, Storage};
 
 /// `L` of a positive matrix `L L^T`.
 #[derive(Debug, Clone)]
@@ -25,10 +19,9 @@ pub struct Factor {
 impl Factor {
     /// Of a matrix of which the lower triangle is read; none if it is not positive.
     pub fn of(mut matrix: DMatrix<f64>) -> Option<Self> {
-        if matrix.nrows() <= FACTORISED {
-            return Some(Self { lower: matrix.cholesky()?.unpack_dirty() });
-        }
-        factorise(matrix.as_view_mut())?;
+        let mut memory = MemBuffer::new(cholesky_in_place_scratch::<f64>(matrix.nrows(), Par::Seq, Default::default()));
+        let (regularization, stack) = (LltRegularization::default(), MemStack::new(&mut memory));
+        cholesky_in_place(view_mut(&mut matrix), regularization, Par::Seq, stack, Default::default()).ok()?;
         Some(Self { lower: matrix })
     }
 
@@ -59,7 +52,7 @@ impl Factor {
         DefaultAllocator: Allocator<Dyn, C>,
     {
         let mut right = right.clone_owned();
-        forward(self.lower.as_view(), whole(&mut right));
+        solve_lower_triangular_in_place(view(&self.lower), view_mut(&mut right), Par::Seq);
         right
     }
 
@@ -76,7 +69,7 @@ impl Factor {
     where
         DefaultAllocator: Allocator<Dyn, C>,
     {
-        backward(self.lower.as_view(), whole(&mut right));
+        solve_upper_triangular_in_place(view(&self.lower).transpose(), view_mut(&mut right), Par::Seq);
         right
     }
 
@@ -93,8 +86,8 @@ impl Factor {
     /// `L^-1`.
     pub fn inverse_lower(&self) -> DMatrix<f64> {
         let n = self.lower.nrows();
-        let mut inverse = DMatrix::identity(n, n);
-        invert(self.lower.as_view(), inverse.as_view_mut());
+        let mut inverse = DMatrix::zeros(n, n);
+        invert_lower_triangular(view_mut(&mut inverse), view(&self.lower), Par::Seq);
         inverse
     }
 }
@@ -106,105 +99,34 @@ pub fn gram(columns: &DMatrix<f64>) -> DMatrix<f64> {
 
 /// `A^T B` that is symmetric: half of the products.
 pub fn symmetric(columns: &DMatrix<f64>, others: &DMatrix<f64>) -> DMatrix<f64> {
-    let back = columns.transpose();
+    use triangular::BlockStructure::{Rectangular, TriangularLower};
     let mut gram = DMatrix::zeros(columns.ncols(), columns.ncols());
-    lower_gram(back.as_view(), others.as_view(), gram.as_view_mut());
+    let (into, back) = (view_mut(&mut gram), view(columns).transpose());
+    triangular::matmul(
+        into,
+        TriangularLower,
+        Accum::Replace,
+        back,
+        Rectangular,
+        view(others),
+        Rectangular,
+        1.0,
+        Par::Seq,
+    );
     gram.fill_upper_triangle_with_lower_triangle();
     gram
 }
 
-fn lower_gram(back: DMatrixView<f64>, columns: DMatrixView<f64>, mut gram: DMatrixViewMut<f64>) {
-    let (n, half) = (gram.nrows(), gram.nrows() / 2);
-    if n <= COLUMNS {
-        gram.gemm(1.0, &back, &columns, 0.0);
-        return;
-    }
-    lower_gram(back.rows(0, half), columns.columns(0, half), gram.view_mut((0, 0), (half, half)));
-    gram.view_mut((half, 0), (n - half, half)).gemm(1.0, &back.rows(half, n - half), &columns.columns(0, half), 0.0);
-    lower_gram(
-        back.rows(half, n - half),
-        columns.columns(half, n - half),
-        gram.view_mut((half, half), (n - half, n - half)),
-    );
+fn view(matrix: &DMatrix<f64>) -> MatRef<'_, f64> {
+    MatRef::from_column_major_slice(matrix.as_slice(), matrix.nrows(), matrix.ncols())
 }
 
-/// A matrix as one of any number of columns.
-fn whole<C: Dim>(matrix: &mut OMatrix<f64, Dyn, C>) -> DMatrixViewMut<'_, f64>
+fn view_mut<C: Dim>(matrix: &mut OMatrix<f64, Dyn, C>) -> MatMut<'_, f64>
 where
     DefaultAllocator: Allocator<Dyn, C>,
 {
     let (rows, columns) = matrix.shape();
-    DMatrixViewMut::from_slice(matrix.as_mut_slice(), rows, columns)
-}
-
-/// The lower triangle of `A` becomes that of `L`: with `A` in four blocks, `L11` of `A11`, `L21 = A21 L11^-T`, `L22` of `A22 - L21 L21^T`.
-fn factorise(mut matrix: DMatrixViewMut<f64>) -> Option<()> {
-    let n = matrix.nrows();
-    if n <= FACTORISED {
-        let factor = matrix.clone_owned().cholesky()?;
-        matrix.copy_from(factor.l_dirty());
-        return Some(());
-    }
-    let half = n / 2;
-    factorise(matrix.view_mut((0, 0), (half, half)))?;
-    let mut across = matrix.view((half, 0), (n - half, half)).transpose();
-    forward(matrix.view((0, 0), (half, half)), across.as_view_mut());
-    let below = across.transpose();
-    matrix.view_mut((half, half), (n - half, n - half)).gemm(-1.0, &below, &across, 1.0);
-    matrix.view_mut((half, 0), (n - half, half)).copy_from(&below);
-    factorise(matrix.view_mut((half, half), (n - half, n - half)))
-}
-
-/// `L^-1` in place of 1: with `L` in four blocks, `L11^-1`, `-L22^-1 L21 L11^-1`, `L22^-1`.
-fn invert(lower: DMatrixView<f64>, mut inverse: DMatrixViewMut<f64>) {
-    let n = lower.nrows();
-    if n <= ROWS {
-        lower.solve_lower_triangular_unchecked_mut(&mut inverse);
-        return;
-    }
-    let half = n / 2;
-    invert(lower.view((0, 0), (half, half)), inverse.view_mut((0, 0), (half, half)));
-    let below = lower.view((half, 0), (n - half, half)) * -inverse.view((0, 0), (half, half));
-    inverse.view_mut((half, 0), (n - half, half)).copy_from(&below);
-    let of_rest = lower.view((half, half), (n - half, n - half));
-    forward(of_rest, inverse.view_mut((half, 0), (n - half, half)));
-    invert(of_rest, inverse.view_mut((half, half), (n - half, n - half)));
-}
-
-/// Solve column by column, or many columns by the product with the inverse.
-fn solve_block(mut right: DMatrixViewMut<f64>, solve: impl Fn(&mut DMatrixViewMut<f64>)) {
-    if right.ncols() < MANY {
-        return solve(&mut right);
-    }
-    let mut inverse = DMatrix::identity(right.nrows(), right.nrows());
-    solve(&mut inverse.as_view_mut());
-    let product = inverse * &right;
-    right.copy_from(&product);
-}
-
-fn forward(lower: DMatrixView<f64>, mut right: DMatrixViewMut<f64>) {
-    let n = lower.nrows();
-    if n <= ROWS || right.ncols() <= FEW {
-        return solve_block(right, |columns| lower.solve_lower_triangular_unchecked_mut(columns));
-    }
-    let half = n / 2;
-    let (mut first, mut rest) = right.rows_range_pair_mut(..half, half..);
-    forward(lower.view((0, 0), (half, half)), first.as_view_mut());
-    rest.gemm(-1.0, &lower.view((half, 0), (n - half, half)), &first, 1.0);
-    forward(lower.view((half, half), (n - half, n - half)), rest);
-}
-
-/// `L^-T B` in place of `B`.
-fn backward(lower: DMatrixView<f64>, mut right: DMatrixViewMut<f64>) {
-    let n = lower.nrows();
-    if n <= ROWS || right.ncols() <= FEW {
-        return solve_block(right, |columns| lower.tr_solve_lower_triangular_unchecked_mut(columns));
-    }
-    let half = n / 2;
-    let (mut first, mut rest) = right.rows_range_pair_mut(..half, half..);
-    backward(lower.view((half, half), (n - half, n - half)), rest.as_view_mut());
-    first.gemm(-1.0, &lower.view((half, 0), (n - half, half)).transpose(), &rest, 1.0);
-    backward(lower.view((0, 0), (half, half)), first);
+    MatMut::from_column_major_slice_mut(matrix.as_mut_slice(), rows, columns)
 }
 
 #[cfg(test)]
@@ -220,7 +142,7 @@ mod tests {
 
     #[test]
     fn a_matrix_times_its_solution_is_the_right_side() {
-        for (n, columns) in [(1, 5), (ROWS, 5), (ROWS + 1, 5), (5 * ROWS + 3, 5), (5 * ROWS + 3, MANY)] {
+        for (n, columns) in [(1, 5), (48, 5), (49, 5), (243, 5), (243, 96)] {
             let right = DMatrix::from_fn(n, columns, |i, j| ((i + 1) * (j + 2)) as f64 % 5.0);
             let matrix = positive(n);
             let factor = Factor::of(matrix.clone()).unwrap();
@@ -240,14 +162,14 @@ mod tests {
 
     #[test]
     fn half_of_the_products_make_the_whole_gram_matrix() {
-        let columns = DMatrix::from_fn(7, 3 * ROWS + 5, |i, j| (1.0 + (3 * i + 7 * j) as f64).sin());
+        let columns = DMatrix::from_fn(7, 149, |i, j| (1.0 + (3 * i + 7 * j) as f64).sin());
         assert!((gram(&columns) - columns.transpose() * &columns).amax() < 1e-12, "rounding");
     }
 
     #[test]
     fn what_is_not_positive_has_no_factor() {
-        let mut matrix = positive(5 * ROWS);
-        matrix[(2 * ROWS, 2 * ROWS)] = -1.0;
+        let mut matrix = positive(240);
+        matrix[(96, 96)] = -1.0;
         assert!(Factor::of(matrix).is_none());
     }
 }

@@ -5,9 +5,10 @@
 //!
 //! `(D B; B^T C)^-1 = (D^-1 + X S^-1 X^T, -X S^-1; -S^-1 X^T, S^-1)`.
 
+use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
 
-use crate::linear::{Factor, product, transposed_product};
+use crate::linear::{product, transposed_product};
 
 /// A symmetric positive matrix with blocks that do not meet, factored.
 pub struct Arrow {
@@ -36,7 +37,7 @@ impl Arrow {
         let inverse = |block: &Vec<usize>| Some(part(block, block).cholesky()?.inverse());
         let blocks = blocks.iter().map(inverse).collect::<Option<Vec<_>>>()?;
         let follow = by_blocks(&blocks, &across);
-        let schur = Factor::of(&(part(&rest, &rest) - transposed_product(&across, &follow)))?;
+        let schur = Factor::of(part(&rest, &rest) - transposed_product(&across, &follow))?;
         Some(Self { eliminated, rest, blocks, follow, schur })
     }
 
@@ -94,7 +95,6 @@ fn by_blocks(blocks: &[DMatrix<f64>], matrix: &DMatrix<f64>) -> DMatrix<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::linear;
     use crate::testing::normal;
 
     #[test]
@@ -110,7 +110,7 @@ mod tests {
         let matrix = root.tr_mul(&root) + DMatrix::identity(n, n);
         let right = DVector::from_fn(n, |_, _| random());
         let arrow = Arrow::of(&matrix, &blocks).unwrap();
-        let inverse = linear::inverse(&matrix).unwrap();
+        let inverse = Factor::of(matrix.clone()).unwrap().inverse();
         assert!((arrow.inverse() - &inverse).amax() < 1e-12 * inverse.amax() * n as f64, "rounding");
         assert!((arrow.solve(&right) - inverse * right).amax() < 1e-11, "rounding");
         assert!(Arrow::of(&-&matrix, &blocks).is_none());

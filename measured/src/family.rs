@@ -21,10 +21,10 @@
 
 use std::collections::BTreeMap;
 
+use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
 
 use crate::folder::Folder;
-use crate::linear::Factor;
 use crate::unknowns::{Groups, Kind, Unknown, holds};
 
 /// Members that a scale can be learnt from; fewer have the prior of the fit each.
@@ -238,14 +238,16 @@ impl Family {
 
     /// `ln` probability of what the data say of the members, and of the scale beforehand; none where rounding leaves no positive curvature.
     pub fn log_evidence(&self, marginal: &Marginal) -> Option<f64> {
-        let whole = Factor::of(&(self.precision() + &marginal.information))?;
-        Some(self.log_prior()? - whole.log_root() + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope)))
+        let whole = Factor::of(self.precision() + &marginal.information)?;
+        Some(
+            self.log_prior()? - 0.5 * whole.log_determinant() + 0.5 * marginal.slope.dot(&whole.solve(&marginal.slope)),
+        )
     }
 
     /// `ln det P/2` and `ln` probability of the scale beforehand, up to a constant.
     pub fn log_prior(&self) -> Option<f64> {
         let square = (self.ordinary / self.scale).powi(2);
-        Some(Factor::of(&self.precision())?.log_root() + 0.5 * BEFOREHAND * (square.ln() - square))
+        Some(0.5 * Factor::of(self.precision())?.log_determinant() + 0.5 * BEFOREHAND * (square.ln() - square))
     }
 
     /// The same with another scale.

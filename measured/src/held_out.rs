@@ -1,11 +1,11 @@
 //! Elements that are predicted without themselves: the matrix is cut into nine parts, some monitors by some correctors, and each is predicted by
 //! the others, to first order about the fit of all.
 
+use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::linear::Factor;
 use crate::model::Prediction;
 use crate::noise::Noise;
 use crate::normal::{Places, times};
@@ -68,7 +68,7 @@ impl HeldOut {
             let matrix = times(&whole - places.information(prediction, &own), &width) + precision;
             let without = &slope - places.back(prediction, &own.component_mul(&residual));
             let downhill = without.component_mul(&width) - &pull;
-            let step = Factor::of(&matrix).ok_or(MeasuredError::Singular(0))?.solve(&downhill).component_mul(&width);
+            let step = Factor::of(matrix).ok_or(MeasuredError::Singular(0))?.solve(&downhill).component_mul(&width);
             let moved = places.forward(prediction, &step);
             left.zip_zip_apply(&moved, &own, |left, moved, own| *left -= if own > 0.0 { moved } else { 0.0 });
             steps.push(step);

@@ -9,6 +9,7 @@
 use core::cmp::Ordering;
 use std::collections::BTreeMap;
 
+use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
@@ -16,7 +17,7 @@ use crate::error::MeasuredError;
 use crate::family::{Family, Marginal, ORDINARY, UNCHANGED, class, families, sort};
 use crate::fit::{Fit, Settings};
 use crate::folder::{Folder, Row};
-use crate::linear::{Factor, inverse, product};
+use crate::linear::product;
 use crate::model::{Model, Prediction};
 use crate::noise::Noise;
 use crate::normal::{Places, times};
@@ -96,7 +97,7 @@ impl Posterior {
         families: &[Family],
     ) -> Result<Self, MeasuredError> {
         let precision = &information + precision(families, slope.len());
-        let covariance = inverse(&precision).ok_or(MeasuredError::Singular(0))?;
+        let covariance = Factor::of(precision).ok_or(MeasuredError::Singular(0))?.inverse();
         Ok(Self { values: &covariance * &slope, information, slope, covariance })
     }
 
@@ -155,10 +156,10 @@ impl Posterior {
     /// `ln` probability of the measurement, linearised, and of the scales beforehand, up to a constant.
     fn log_evidence(&self, families: &[Family]) -> Result<f64, MeasuredError> {
         let whole = &self.information + precision(families, self.slope.len());
-        let factor = Factor::of(&whole).ok_or(MeasuredError::Singular(0))?;
+        let factor = Factor::of(whole).ok_or(MeasuredError::Singular(0))?;
         let priors: Option<f64> = families.iter().map(Family::log_prior).sum();
         let priors = priors.ok_or(MeasuredError::Singular(0))?;
-        Ok(priors - factor.log_root() + 0.5 * self.slope.dot(&factor.solve(&self.slope)))
+        Ok(priors - 0.5 * factor.log_determinant() + 0.5 * self.slope.dot(&factor.solve(&self.slope)))
     }
 
     /// The scales of some families that make the measurement most probable: that of the family first which gains most, since what one explains another needs not to.
@@ -214,7 +215,7 @@ impl Posterior {
     /// [`MeasuredError::Singular`].
     pub fn marginal(&self, family: &Family) -> Result<Marginal, MeasuredError> {
         let covariance = self.covariance.select_rows(&family.members).select_columns(&family.members);
-        let whole = inverse(&covariance).ok_or(MeasuredError::Singular(0))?;
+        let whole = Factor::of(covariance).ok_or(MeasuredError::Singular(0))?.inverse();
         let slope = &whole * self.values.select_rows(&family.members);
         Ok(Marginal { information: whole - family.precision(), slope })
     }
@@ -509,7 +510,7 @@ impl Start {
         while *damping < STUCK {
             let mut damped = whole.clone();
             (0..downhill.len()).for_each(|i| damped[(i, i)] *= 1.0 + *damping);
-            let step = Factor::of(&damped).ok_or(MeasuredError::Singular(0))?.solve(&downhill);
+            let step = Factor::of(damped).ok_or(MeasuredError::Singular(0))?.solve(&downhill);
             let there = &self.values + step.component_mul(&scene.width);
             match scene.model.predict(&self.unknowns, &there) {
                 Ok(better) if distance(&there, &better) <= now => {

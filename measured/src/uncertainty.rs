@@ -12,11 +12,12 @@
 //! Source: A. C. Cameron, J. B. Gelbach and D. L. Miller, J. Bus. Econ. Stat. 29 (2011) 238, eq. 2.8; H. White,
 //! Econometrica 48 (1980) 817.
 
+use evidence::Factor;
 use nalgebra::{DMatrix, DVector};
 
 use crate::data::Data;
 use crate::error::MeasuredError;
-use crate::linear::{inverse, product, transposed_product};
+use crate::linear::{product, transposed_product};
 use crate::model::Prediction;
 use crate::noise::Noise;
 use crate::normal::{Places, in_widths, times};
@@ -49,7 +50,8 @@ impl Uncertainty {
         let places = Places::of(unknowns, residual.nrows(), residual.ncols());
         let information = places.information(at, &data.information(noise));
         let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
-        let inverse = inverse(&in_widths(information.clone(), &width)).ok_or(MeasuredError::Singular(0))?;
+        let curvature = Factor::of(in_widths(information.clone(), &width)).ok_or(MeasuredError::Singular(0))?;
+        let inverse = curvature.inverse();
         let independent = times(inverse, &width);
         Ok(Self::about((&places, at), (independent, information), (data, noise)))
     }
