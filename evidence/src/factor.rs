@@ -171,5 +171,6 @@ mod tests {
         let mut matrix = positive(240);
         matrix[(96, 96)] = -1.0;
         assert!(Factor::of(matrix).is_none());
+        assert!(Factor::of(positive(5) * f64::NAN).is_none());
     }
 }

@@ -19,6 +19,7 @@ use crate::linear::LANES;
 use crate::model::{Model, Prediction};
 use crate::noise::Noise;
 use crate::normal::Places;
+use crate::straight::DEAD;
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Unknown, Widths, groups, unknowns};
 
@@ -206,6 +207,17 @@ impl Fit {
     /// Standard deviation of an unknown.
     pub fn sigma(&self, unknown: usize) -> f64 {
         self.uncertainty.sigma[unknown]
+    }
+
+    /// True of a gain that the readings by themselves tell to be near 0, and not as expected: the prior draws that of a dead instrument among noise to 1.
+    pub fn is_dead(&self, unknown: usize) -> bool {
+        let Unknown { kind, mean, width } = self.unknowns[unknown];
+        let variance = self.uncertainty.independent[(unknown, unknown)];
+        // what the readings tell of a value, the rest is of the prior
+        let share = 1.0 - variance / (width * width);
+        let (gain, sigma) = (mean + (self.values[unknown] - mean) / share, (variance / share).sqrt());
+        let is_gain = matches!(kind, Kind::MonitorGain(_) | Kind::CorrectorGain(_));
+        is_gain && gain.abs() < DEAD && (mean - gain).abs() > CERTAIN * sigma
     }
 
     /// By how much the stated noise is larger than what the fit leaves over, unknowns counted, where that is more than chance and than noise is

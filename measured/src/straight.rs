@@ -48,10 +48,10 @@ impl Straightened {
 
     /// Without the instruments that the fit finds dead, which their cables may have been exchanged with.
     fn without_dead(mut self, settings: &Settings, progress: &mut dyn FnMut(&str)) -> Result<Self, MeasuredError> {
-        let dead = self.fit.unknowns.iter().zip(&self.fit.values).filter(|(_, gain)| gain.abs() < DEAD);
+        let dead = (0..self.fit.unknowns.len()).filter(|&unknown| self.fit.is_dead(unknown));
         let (mut rows, mut columns) = (Vec::new(), Vec::new());
-        for (unknown, _) in dead {
-            match unknown.kind {
+        for unknown in dead {
+            match self.fit.unknowns[unknown].kind {
                 Kind::MonitorGain(row) if self.folder.monitors[row].is_used => rows.push(row),
                 Kind::CorrectorGain(column) if self.folder.correctors[column].is_used => columns.push(column),
                 _ => {}
@@ -155,6 +155,20 @@ mod tests {
         assert_eq!(found.cables, [Wiring::MonitorsDead(vec![7]), Wiring::CorrectorsDead(vec![20])]);
         assert!(!found.folder.monitors[7].is_used && !found.folder.correctors[20].is_used);
         assert_eq!(found.fit.elements, 23 * 23 + 23);
+    }
+
+    /// Noise of a third of the orbits: readings tell a gain to 0.1, and the prior of 0.2 draws that of a dead monitor to 0.2.
+    #[test]
+    fn a_dead_monitor_among_noise_is_left_out_and_no_other() {
+        let ring = ring();
+        for seed in 0..4 {
+            let mut folder = measured(&ring, &machine(&ring, 20 + seed), 150.0 * NOISE, seed);
+            folder.monitors.iter_mut().for_each(|monitor| monitor.sigma = 150.0 * NOISE);
+            assert_eq!(of(&folder).cables, [], "{seed}");
+            let mut normal = normal(seed);
+            folder.matrix.row_mut(7).iter_mut().for_each(|element| *element = 150.0 * NOISE * normal());
+            assert_eq!(of(&folder).cables, [Wiring::MonitorsDead(vec![7])], "{seed}");
+        }
     }
 
     #[test]
