@@ -19,7 +19,6 @@ use crate::linear::LANES;
 use crate::model::{Model, Prediction};
 use crate::noise::Noise;
 use crate::normal::Places;
-use crate::straight::DEAD;
 use crate::uncertainty::Uncertainty;
 use crate::unknowns::{Groups, Kind, Unknown, Widths, groups, unknowns};
 
@@ -109,7 +108,9 @@ impl Start {
     }
 }
 
-/// Standard deviations beyond which a sum of squares is no chance.
+/// A gain below this is that of a dead instrument.
+pub const DEAD: f64 = 0.2;
+/// Standard deviations beyond which a deviation is no chance.
 const CERTAIN: f64 = 4.0;
 /// Noise from a few repeats is known to such a factor.
 const KNOWN: f64 = 1.5;

@@ -8,14 +8,11 @@ use nalgebra::DMatrix;
 use twin::median;
 
 use crate::error::MeasuredError;
-use crate::fit::{Fit, Settings, Start, fit};
+use crate::fit::{DEAD, Fit, Settings, Start, fit};
 use crate::folder::Folder;
 use crate::model::Model;
 use crate::unknowns::{Kind, groups};
 use crate::wiring::{Wiring, exchanged_back, straightened};
-
-/// A gain below this is that of a dead instrument.
-pub const DEAD: f64 = 0.2;
 
 /// A measurement with its cables put right, and its fit.
 #[derive(Debug, Clone)]
