@@ -13,9 +13,10 @@ use nalgebra::DMatrix;
 use serde_json::{Value, json};
 use twin::Plane;
 
-use crate::fit::{DEAD, Fit};
+use crate::fit::Fit;
 use crate::folder::{CorrectorRow, Folder};
 use crate::lattice;
+use crate::straight::DEAD;
 use crate::unknowns::{Kind, gains};
 
 /// A monitor's plane.

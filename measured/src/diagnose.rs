@@ -9,13 +9,14 @@ use nalgebra::DMatrix;
 use twin::{Rf, median};
 
 use crate::error::MeasuredError;
-use crate::fit::{DEAD, Fit, Settings};
+use crate::fit::{Fit, Settings};
 use crate::folder::Folder;
 use crate::held_out::HeldOut;
 use crate::hierarchy::Hierarchy;
 use crate::hold::Share;
 use crate::model::Model;
 use crate::search::{NAMED, Outlier, Rival, Search, search};
+use crate::straight::DEAD;
 use crate::unknowns::{self, Groups, Kind, name};
 use crate::wiring::Wiring;
 

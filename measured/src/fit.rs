@@ -108,9 +108,7 @@ impl Start {
     }
 }
 
-/// A gain below this is that of a dead instrument.
-pub const DEAD: f64 = 0.2;
-/// Standard deviations beyond which a deviation is no chance.
+/// Standard deviations beyond which a sum of squares is no chance.
 const CERTAIN: f64 = 4.0;
 /// Noise from a few repeats is known to such a factor.
 const KNOWN: f64 = 1.5;
@@ -208,17 +206,6 @@ impl Fit {
     /// Standard deviation of an unknown.
     pub fn sigma(&self, unknown: usize) -> f64 {
         self.uncertainty.sigma[unknown]
-    }
-
-    /// True of a gain that the readings by themselves tell to be near 0, and not as expected: the prior draws that of a dead instrument among noise to 1.
-    pub fn is_dead(&self, unknown: usize) -> bool {
-        let Unknown { kind, mean, width } = self.unknowns[unknown];
-        let variance = self.uncertainty.independent[(unknown, unknown)];
-        // what the readings tell of a value, the rest is of the prior
-        let share = 1.0 - variance / (width * width);
-        let (gain, sigma) = (mean + (self.values[unknown] - mean) / share, (variance / share).sqrt());
-        let is_gain = matches!(kind, Kind::MonitorGain(_) | Kind::CorrectorGain(_));
-        is_gain && gain.abs() < DEAD && (mean - gain).abs() > CERTAIN * sigma
     }
 
     /// By how much the stated noise is larger than what the fit leaves over, unknowns counted, where that is more than chance and than noise is

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use comfy_table::CellAlignment;
 use diagnosis::capitalised;
 use measured::believed::{Believed, Value};
-use measured::fit::DEAD;
+use measured::straight::DEAD;
 use measured::unknowns::{Groups, Unknown, name};
 use measured::{Fit, Folder, Kind, Wiring};
 use schemars::JsonSchema;
