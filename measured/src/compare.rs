@@ -201,7 +201,7 @@ fn families(changed: &Hierarchy) -> Result<Vec<Other>, MeasuredError> {
 fn is_told_alone(changed: &Hierarchy, number: usize) -> bool {
     let is_alone = match changed.unknowns[number].kind {
         Kind::Strength(_) => changed.classes[number] == ALL,
-        Kind::RfScale | Kind::Wiggler(_) | Kind::TiltedWiggler(_) | Kind::Added(_) => true,
+        Kind::RfScale | Kind::Wiggler(_) | Kind::Moment(0, ..) | Kind::Added(_) => true,
         _ => false,
     };
     // beside what those of its kind change where nothing was changed
@@ -225,7 +225,7 @@ fn other(folder: &Folder, changed: &Hierarchy, number: usize) -> Other {
     let kind = changed.unknowns[number].kind;
     let (change, sigma) = change(changed, number);
     let unit = match kind {
-        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::TiltedWiggler(_) => "1/m",
+        Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::Moment(0, ..) => "1/m",
         Kind::Added(_) => "1/m^2",
         _ => "",
     };

@@ -100,12 +100,7 @@ impl Departures {
         let gain = match self.unknowns[at].kind {
             Kind::MonitorCoupling(row) => Some(Kind::MonitorGain(row)),
             Kind::CorrectorCoupling(column) => Some(Kind::CorrectorGain(column)),
-            Kind::Skew(_)
-            | Kind::Gradient(_)
-            | Kind::Wiggler(_)
-            | Kind::TiltedWiggler(_)
-            | Kind::Moment(..)
-            | Kind::Added(_) => {
+            Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::Moment(..) | Kind::Added(_) => {
                 return (after - before, self.sigma(at));
             }
             _ => None,
@@ -159,9 +154,7 @@ fn followed(uncertainty: &Uncertainty, unknowns: &[Unknown], errors: &DMatrix<f6
 pub fn beforehand(kind: Kind) -> f64 {
     match kind {
         Kind::Strength(_) => DEPARTURES.strength,
-        Kind::Skew(_) | Kind::Gradient(_) | Kind::TiltedWiggler(_) | Kind::Moment(..) | Kind::Added(_) => {
-            DEPARTURES.skew
-        }
+        Kind::Skew(_) | Kind::Gradient(_) | Kind::Moment(..) | Kind::Added(_) => DEPARTURES.skew,
         Kind::Wiggler(_) => DEPARTURES.wiggler,
         Kind::MonitorGain(_) | Kind::CorrectorGain(_) | Kind::RfScale | Kind::HeldFrequency => DEPARTURES.gain,
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => DEPARTURES.coupling,

@@ -344,9 +344,7 @@ fn path_length(folder: &Folder, groups: &Groups, kind: Kind) -> f64 {
         Kind::Strength(group) | Kind::Added(group) => middle(groups[0][group][0]),
         Kind::Skew(group) => middle(groups[1][group][0]),
         Kind::Gradient(group) => middle(groups[2][group][0]),
-        Kind::Wiggler(group) | Kind::TiltedWiggler(group) | Kind::Moment(_, group) => {
-            middle(unknowns::middle(&groups[3][group]))
-        }
+        Kind::Wiggler(group) | Kind::Moment(.., group) => middle(unknowns::middle(&groups[3][group])),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => middle(folder.monitors[row].at),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => middle(folder.correctors[column].at),
         Kind::RfScale | Kind::HeldFrequency => 0.0,

@@ -136,7 +136,7 @@ pub fn class(folder: &Folder, groups: &Groups, kind: Kind) -> String {
         Kind::Gradient(group) => sort(folder, groups[2][group][0]).into(),
         Kind::Added(group) => sort(folder, groups[0][group][0]).into(),
         Kind::Wiggler(_) => "straights".into(),
-        Kind::TiltedWiggler(_) | Kind::Moment(..) | Kind::RfScale | Kind::HeldFrequency => String::new(),
+        Kind::Moment(..) | Kind::RfScale | Kind::HeldFrequency => String::new(),
     }
 }
 

@@ -276,11 +276,9 @@ impl Hierarchy {
         start.settle(model, ROUNDS / 2, progress)
     }
 
-    /// True of what is released, and of what else a wiggler has in its straight where that is.
+    /// True of what is released, and of the moments in its straight where a wiggler is.
     fn is_freed(&self, number: usize, released: &[usize]) -> bool {
-        let (Kind::Moment(_, straight) | Kind::TiltedWiggler(straight)) = self.unknowns[number].kind else {
-            return released.contains(&number);
-        };
+        let Kind::Moment(.., straight) = self.unknowns[number].kind else { return released.contains(&number) };
         released.iter().any(|&other| self.unknowns[other].kind == Kind::Wiggler(straight))
     }
 

@@ -279,14 +279,13 @@ impl Model {
             Kind::Skew(group) => return each(&self.skews[group], Change::Skew),
             Kind::Gradient(group) => return each(&self.gradients[group], Change::Normal),
             Kind::Wiggler(group) => (group, Change::Vertical),
-            Kind::TiltedWiggler(group) => (group, Change::Skew),
-            Kind::Moment(change, group) => (group, change),
+            Kind::Moment(_, change, group) => (group, change),
             _ => return Vec::new(),
         };
         let pairs = &self.straights[group];
         let squares: f64 = pairs.iter().map(|pair| pair.off * pair.off).sum();
         let share = |pair: &Pair| match kind {
-            Kind::Moment(..) => pair.off / squares,
+            Kind::Moment(1, ..) => pair.off / squares,
             _ => 1.0 / pairs.len() as f64,
         };
         let element = |pair: &Pair| if change == Change::Vertical { pair.wiggler } else { pair.gradient };
@@ -385,8 +384,8 @@ mod tests {
                 shares.fold([0.0; 2], |[sum, first], ((_, _, share), pair)| [sum + share, first + share * pair.off])
             };
             let changes = [Change::Normal, Change::Vertical, Change::Skew];
-            let firsts = changes.map(|change| (Kind::Moment(change, group), [0.0, 1.0]));
-            let wholes = [Kind::Wiggler(group), Kind::TiltedWiggler(group)].map(|kind| (kind, [1.0, 0.0]));
+            let firsts = changes.map(|change| (Kind::Moment(1, change, group), [0.0, 1.0]));
+            let wholes = [Kind::Wiggler(group), Kind::Moment(0, Change::Skew, group)].map(|kind| (kind, [1.0, 0.0]));
             for (kind, expected) in wholes.into_iter().chain(firsts) {
                 let found = moments(kind);
                 assert!((0..2).all(|order| (found[order] - expected[order]).abs() < 1e-12), "{kind:?}: {found:?}");

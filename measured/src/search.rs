@@ -113,7 +113,7 @@ fn expected(kind: Kind) -> f64 {
         Kind::MonitorCoupling(_) | Kind::CorrectorCoupling(_) => 0.1,
         Kind::Strength(_) => 0.2,
         Kind::Skew(_) | Kind::Gradient(_) | Kind::Wiggler(_) | Kind::Added(_) => 0.1,
-        Kind::TiltedWiggler(_) | Kind::Moment(..) | Kind::RfScale | Kind::HeldFrequency => 0.0,
+        Kind::Moment(..) | Kind::RfScale | Kind::HeldFrequency => 0.0,
     }
 }
 

@@ -105,7 +105,6 @@ pub fn machine(folder: &Folder, seed: u64) -> (Model, Vec<Unknown>, DVector<f64>
         Kind::Gradient(_)
         | Kind::Added(_)
         | Kind::Wiggler(_)
-        | Kind::TiltedWiggler(_)
         | Kind::Moment(..)
         | Kind::RfScale
         | Kind::HeldFrequency => 0.0,

@@ -50,8 +50,8 @@ impl Uncertainty {
         let places = Places::of(unknowns, residual.nrows(), residual.ncols());
         let information = places.information(at, &data.information(noise));
         let width = DVector::from_iterator(unknowns.len(), unknowns.iter().map(|one| one.width));
-        let curvature = Factor::of(in_widths(information.clone(), &width)).ok_or(MeasuredError::Singular(0))?;
-        let inverse = curvature.inverse();
+        let curvature = in_widths(information.clone(), &width);
+        let inverse = Factor::of(curvature).ok_or(MeasuredError::Singular(0))?.inverse();
         let independent = times(inverse, &width);
         Ok(Self::about((&places, at), (independent, information), (data, noise)))
     }

@@ -16,10 +16,8 @@ pub enum Kind {
     Gradient(usize),
     /// Integrated vertical focusing along a straight [1/m], as of a wiggler.
     Wiggler(usize),
-    /// Integrated skew gradient along a straight [1/m], as of a wiggler whose poles are tilted.
-    TiltedWiggler(usize),
-    /// First moment of what acts along a straight about its middle: the integral of the gradient [1/m^2] times the distance [m].
-    Moment(Change, usize),
+    /// Moment of some order of what acts along a straight: the integral of the gradient [1/m^2] times that power of the distance from its middle [m].
+    Moment(u8, Change, usize),
     /// Gradient of each magnet of a group beside its own, which is 0 or nearly so, all along it [1/m^2].
     Added(usize),
     /// Share of the orbit that a held RF frequency adds, 1 where it is held and 0 where the momentum is.
@@ -36,14 +34,14 @@ pub enum Kind {
     RfScale,
 }
 
-/// What is fitted along so many straights, in the order of the unknowns: vertical focusing, a skew gradient, then moments.
+/// What is fitted along so many straights, in the order of the unknowns: vertical focusing, a skew gradient, then first moments.
 pub fn fields_along(straights: usize) -> impl Iterator<Item = Kind> {
     let kinds: [fn(usize) -> Kind; 5] = [
         Kind::Wiggler,
-        Kind::TiltedWiggler,
-        |straight| Kind::Moment(Change::Normal, straight),
-        |straight| Kind::Moment(Change::Vertical, straight),
-        |straight| Kind::Moment(Change::Skew, straight),
+        |straight| Kind::Moment(0, Change::Skew, straight),
+        |straight| Kind::Moment(1, Change::Normal, straight),
+        |straight| Kind::Moment(1, Change::Vertical, straight),
+        |straight| Kind::Moment(1, Change::Skew, straight),
     ];
     kinds.into_iter().flat_map(move |kind| (0..straights).map(kind))
 }
@@ -53,12 +51,12 @@ impl Kind {
     pub fn word(self) -> &'static str {
         match self {
             Self::Strength(_) => "quadrupole_gradient",
-            Self::Skew(_) | Self::TiltedWiggler(_) => "skew_gradient",
+            Self::Skew(_) | Self::Moment(0, Change::Skew, _) => "skew_gradient",
             Self::Gradient(_) => "stray_gradient",
             Self::Wiggler(_) => "wiggler_focusing",
-            Self::Moment(Change::Normal, _) => "gradient_moment",
-            Self::Moment(Change::Vertical, _) => "wiggler_moment",
-            Self::Moment(Change::Skew, _) => "skew_gradient_moment",
+            Self::Moment(_, Change::Normal, _) => "gradient_moment",
+            Self::Moment(_, Change::Vertical, _) => "wiggler_moment",
+            Self::Moment(_, Change::Skew, _) => "skew_gradient_moment",
             Self::Added(_) => "added_gradient",
             Self::HeldFrequency => "fixed_rf_frequency",
             Self::MonitorGain(_) => "bpm_gain",
@@ -77,7 +75,6 @@ impl Kind {
             | Self::Skew(_)
             | Self::Gradient(_)
             | Self::Wiggler(_)
-            | Self::TiltedWiggler(_)
             | Self::Moment(..)
             | Self::HeldFrequency => true,
             Self::MonitorGain(_)
@@ -297,9 +294,7 @@ pub fn name(folder: &Folder, groups: &Groups, kind: Kind) -> String {
         Kind::Added(group) => folder.element(groups[0][group][0]),
         Kind::Skew(group) => folder.element(groups[1][group][0]),
         Kind::Gradient(group) => folder.element(groups[2][group][0]),
-        Kind::Wiggler(group) | Kind::TiltedWiggler(group) | Kind::Moment(_, group) => {
-            folder.element(middle(&groups[3][group]))
-        }
+        Kind::Wiggler(group) | Kind::Moment(.., group) => folder.element(middle(&groups[3][group])),
         Kind::MonitorGain(row) | Kind::MonitorCoupling(row) => folder.monitor(row),
         Kind::CorrectorGain(column) | Kind::CorrectorCoupling(column) => folder.corrector(column),
         Kind::RfScale | Kind::HeldFrequency => "RF".into(),
